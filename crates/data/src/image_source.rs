@@ -1,0 +1,229 @@
+//! Pixels on demand, already brought to network size.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use geometry::{ImageEdit, Rigid};
+use image::RgbImage;
+
+use crate::resample::resample;
+use crate::{DataError, jpeg};
+
+/// Where the pixels of a view are.
+#[derive(Debug, Clone)]
+pub enum ImageSource {
+    /// An encoded picture on disk whose size must equal the table's.
+    File {
+        /// Absolute path, checked to lie inside the dataset's folder.
+        path: PathBuf,
+        /// Width and height the tables announce.
+        size: (u32, u32),
+    },
+    /// A camera in the procedural world; rendered exactly at the asked size.
+    Rendered {
+        /// The world at one instant.
+        snapshot: Arc<world::Snapshot>,
+        /// Raw camera.
+        camera: geometry::Camera,
+        /// Camera pose.
+        world_from_cam: Rigid,
+    },
+}
+
+impl ImageSource {
+    /// The edited picture, RGB8 of the edit's size.
+    ///
+    /// A file is decoded and resampled (area average when shrinking); a rendered source casts its rays through the edited
+    /// camera, so no resampling takes place.
+    ///
+    /// # Errors
+    /// [`DataError::Missing`], [`DataError::Image`] or [`DataError::ImageSize`], naming the file; [`DataError::Config`] for an edit
+    /// that is not made of scale, shift and mirror.
+    pub fn load(&self, edit: &ImageEdit) -> Result<RgbImage, DataError> {
+        match self {
+            Self::File { path, size } => resample(&decode_file(path, *size)?, edit),
+            Self::Rendered { snapshot, camera, world_from_cam } => render(snapshot, camera, world_from_cam, edit),
+        }
+    }
+
+    /// A picture file's own pixels; a rendered source gives its raw camera's picture.
+    ///
+    /// # Errors
+    /// As [`ImageSource::load`].
+    pub fn decode(&self) -> Result<RgbImage, DataError> {
+        match self {
+            Self::File { path, size } => decode_file(path, *size),
+            Self::Rendered { snapshot, camera, world_from_cam } => {
+                let edit = ImageEdit::identity(camera.intrinsics.width, camera.intrinsics.height);
+                render(snapshot, camera, world_from_cam, &edit)
+            }
+        }
+    }
+
+    /// Whether a file exists, holds the announced size and does not end early, without decoding its pixels. Rendered sources always pass.
+    ///
+    /// # Errors
+    /// As [`ImageSource::load`], as far as the markers of the file show it.
+    pub fn inspect(&self) -> Result<(), DataError> {
+        match self {
+            Self::File { path, size } => inspect_file(path, *size),
+            Self::Rendered { .. } => Ok(()),
+        }
+    }
+}
+
+/// Rays through the edited camera: a flip is a negative focal length, a crop a shifted principal point, a resize a scaled one.
+fn render(
+    snapshot: &world::Snapshot,
+    raw: &geometry::Camera,
+    world_from_cam: &Rigid,
+    edit: &ImageEdit,
+) -> Result<RgbImage, DataError> {
+    let camera = geometry::Camera::new(edit.intrinsics(&raw.intrinsics), raw.lens)
+        .map_err(|error| DataError::Config(format!("the edited camera cannot be rendered: {error}")))?;
+    // Loader threads render one picture each, so a picture must not spread over the thread pool.
+    let rendering = snapshot.render_serial(&camera, world_from_cam, &world::RenderOptions::default());
+    RgbImage::from_raw(rendering.width, rendering.height, rendering.rgb)
+        .ok_or_else(|| DataError::Config("the renderer returned a picture of another size".to_owned()))
+}
+
+fn open(path: &Path) -> Result<std::fs::File, DataError> {
+    std::fs::File::open(path).map_err(|source| match source.kind() {
+        std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory => {
+            DataError::Missing { what: "picture".to_owned(), path: path.to_owned() }
+        }
+        _ => DataError::Io { action: "open", source, path: path.to_owned() },
+    })
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, DataError> {
+    let mut bytes = Vec::new();
+    open(path)?.read_to_end(&mut bytes).map_err(|source| DataError::Io {
+        action: "read",
+        source,
+        path: path.to_owned(),
+    })?;
+    Ok(bytes)
+}
+
+/// All pixels of a picture whose size is known from its table; checked against the file's header before a pixel buffer is reserved.
+fn decode_file(path: &Path, size: (u32, u32)) -> Result<RgbImage, DataError> {
+    let bytes = read(path)?;
+    if jpeg::is_jpeg(&bytes) { jpeg::decode(&bytes, size, path) } else { decode_other(&bytes, size, path) }
+}
+
+/// PNG, the other format that datasets and writers use.
+fn decode_other(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbImage, DataError> {
+    let bad = |why: String| DataError::Image { why, path: path.to_owned() };
+    let reader = || image::ImageReader::new(std::io::Cursor::new(bytes)).with_guessed_format();
+    let got = reader()
+        .map_err(|error| bad(error.to_string()))?
+        .into_dimensions()
+        .map_err(|_| bad("neither a JPEG nor a PNG".to_owned()))?;
+    if got != want {
+        return Err(DataError::ImageSize { got, want, path: path.to_owned() });
+    }
+    let decoded = reader().map_err(|error| bad(error.to_string()))?.decode();
+    Ok(decoded.map_err(|error| bad(error.to_string()))?.to_rgb8())
+}
+
+fn inspect_file(path: &Path, size: (u32, u32)) -> Result<(), DataError> {
+    use std::io::{Seek, SeekFrom};
+    let io = |source| DataError::Io { action: "read", source, path: path.to_owned() };
+    let mut file = open(path)?;
+    let mut head = Vec::new();
+    file.by_ref().take(64 * 1024).read_to_end(&mut head).map_err(io)?;
+    let length = file.seek(SeekFrom::End(0)).map_err(io)?;
+    let mut tail = [0u8; 2];
+    if length >= 2 {
+        file.seek(SeekFrom::End(-2)).map_err(io)?;
+        file.read_exact(&mut tail).map_err(io)?;
+    }
+    let quick = jpeg::outline(&head, true);
+    match quick {
+        Ok(outline) if outline.size == size && tail == [0xFF, 0xD9] => Ok(()),
+        // Long application segments, trailing bytes, other formats and every real fault: decode and say it exactly.
+        _ => decode_file(path, size).map(|_| ()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use image::{ImageEncoder, Rgb};
+
+    use super::*;
+
+    fn jpeg_bytes(width: u32, height: u32) -> Vec<u8> {
+        let picture = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 5) as u8, (y * 7) as u8, ((x ^ y) * 3) as u8]));
+        let mut bytes = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95)
+            .write_image(picture.as_raw(), width, height, image::ExtendedColorType::Rgb8)
+            .unwrap();
+        bytes
+    }
+
+    fn source(folder: &Path, name: &str, bytes: &[u8], size: (u32, u32)) -> ImageSource {
+        let path = folder.join(name);
+        std::fs::write(&path, bytes).unwrap();
+        ImageSource::File { path, size }
+    }
+
+    #[test]
+    fn every_truncation_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let bytes = jpeg_bytes(48, 32);
+        let edit = ImageEdit::identity(48, 32);
+        assert!(source(folder.path(), "whole.jpg", &bytes, (48, 32)).load(&edit).is_ok());
+        for length in 0..bytes.len() {
+            let cut = source(folder.path(), "cut.jpg", &bytes[..length], (48, 32));
+            let error = cut.load(&edit).unwrap_err();
+            assert!(matches!(error, DataError::Image { .. }), "{length} of {} bytes gave {error:?}", bytes.len());
+            assert!(error.to_string().ends_with("cut.jpg"), "{error}");
+            assert!(cut.inspect().is_err());
+        }
+    }
+
+    #[test]
+    fn a_cut_scan_with_an_end_marker_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = jpeg_bytes(64, 64);
+        bytes.truncate(bytes.len() * 3 / 5);
+        bytes.extend([0xFF, 0xD9]);
+        let error = source(folder.path(), "patched.jpg", &bytes, (64, 64)).load(&ImageEdit::identity(64, 64));
+        assert!(matches!(error, Err(DataError::Image { .. })), "{error:?}");
+    }
+
+    #[test]
+    fn trailing_bytes_after_the_end_are_allowed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = jpeg_bytes(16, 16);
+        bytes.extend([0; 37]);
+        let picture = source(folder.path(), "tail.jpg", &bytes, (16, 16));
+        picture.inspect().unwrap();
+        picture.load(&ImageEdit::identity(16, 16)).unwrap();
+    }
+
+    #[test]
+    fn sizes_are_checked_before_decoding() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = jpeg_bytes(16, 16);
+        let frame = bytes.windows(2).position(|w| w == [0xFF, 0xC0]).unwrap();
+        bytes[frame + 5..frame + 9].copy_from_slice(&[0xFF, 0xDC, 0xFF, 0xDC]);
+        let error = source(folder.path(), "huge.jpg", &bytes, (16, 16)).load(&ImageEdit::identity(16, 16)).unwrap_err();
+        assert!(matches!(error, DataError::ImageSize { got: (65500, 65500), want: (16, 16), .. }), "{error:?}");
+    }
+
+    #[test]
+    fn png_and_grey_files_load_and_other_files_do_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("grey.png");
+        image::GrayImage::from_fn(9, 5, |x, y| image::Luma([(x + 10 * y) as u8])).save(&path).unwrap();
+        let picture = ImageSource::File { path, size: (9, 5) }.load(&ImageEdit::identity(9, 5)).unwrap();
+        assert_eq!(picture.get_pixel(3, 4), &Rgb([43, 43, 43]));
+        let text = source(folder.path(), "text.jpg", b"hello there", (9, 5));
+        assert!(matches!(text.load(&ImageEdit::identity(9, 5)), Err(DataError::Image { .. })));
+        let absent = ImageSource::File { path: folder.path().join("absent.jpg"), size: (1, 1) };
+        assert!(matches!(absent.load(&ImageEdit::identity(1, 1)), Err(DataError::Missing { .. })));
+    }
+}

@@ -1,0 +1,36 @@
+//! Native dataset readers and writers, mixtures of rigs, conditions, batches and the loader.
+
+mod augment;
+mod batch;
+mod error;
+mod frame;
+mod image_source;
+mod jpeg;
+mod loader;
+mod mixture;
+pub mod nuscenes;
+mod nuscenes_writer;
+mod pass;
+mod permutation;
+mod procedural;
+mod procedural_cache;
+mod registry;
+mod resample;
+mod sample;
+mod seeding;
+pub mod taxonomy;
+mod undistort;
+
+pub use augment::{AugmentConfig, ColorJitter, RigMotion};
+pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
+pub use error::DataError;
+pub use frame::{Capabilities, Clip, FrameId, MapArea, MapKind, MapLine, ObjectBox, SceneDataset, SceneFrame, View};
+pub use image_source::ImageSource;
+pub use loader::{Loader, LoaderConfig};
+pub use mixture::{Mixture, MixtureConfig, MixtureOrder, MixtureWeights};
+pub use nuscenes_writer::{Manifest, ManifestScene, NuScenesWriterConfig, write_nuscenes};
+pub use pass::InOrder;
+pub use procedural::{Procedural, ProceduralConfig, RigSource};
+pub use registry::{DatasetConfig, open};
+pub use sample::{ImageSize, PoseMode, Sample, SampleOptions, SampleView, rerig};
+pub use taxonomy::ObjectClass;

@@ -1,0 +1,244 @@
+//! nuScenes: reader of the native tables.
+//!
+//! Every picture keeps its own ego pose and stamp, rigs are per scene, and cameras are ordered clockwise from the front by their
+//! calibration. Channel names stay inside this folder. Format: <https://www.nuscenes.org/nuscenes#data-format>, as checked on real files.
+
+mod annotations;
+mod boxes;
+mod check;
+mod config;
+mod json;
+mod pictures;
+mod rows;
+mod sets;
+mod tables;
+mod token;
+
+use std::ops::Range;
+use std::path::PathBuf;
+
+use geometry::{GeometryError, Lens, PoseTrack, Rigid};
+
+pub use boxes::WorldBox;
+pub use check::{CheckReport, check};
+pub use config::{BoxMode, ClassRule, FrameChoice, NuScenesConfig, PictureTime};
+
+use annotations::Annotations;
+use pictures::Pictures;
+use sets::{PictureSet, SceneRig, Slot};
+use tables::Base;
+
+use crate::{Capabilities, DataError, FrameId, ImageSource, ObjectBox, SceneDataset, SceneFrame, View};
+
+/// A lidar key row whose pose is further from its sample's stamp than this does not belong to that instant (interpolated tables).
+const SAME_INSTANT_NS: i64 = 1_000_000;
+
+/// An opened nuScenes-layout dataset. Tables are in memory, pictures are opened on demand.
+#[derive(Debug)]
+pub struct NuScenes {
+    config: NuScenesConfig,
+    root: PathBuf,
+    base: Base,
+    pictures: Pictures,
+    annotations: Option<Annotations>,
+    rigs: Vec<SceneRig>,
+    sets: Vec<PictureSet>,
+    ranges: Vec<Range<usize>>,
+}
+
+/// A scene of an opened dataset.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SceneInfo {
+    /// Name, as in the split lists.
+    pub name: String,
+    /// City district whose map it lies on.
+    pub location: String,
+    /// Recording it was cut from.
+    pub logfile: String,
+    /// Its frames.
+    pub frames: Range<usize>,
+}
+
+impl NuScenes {
+    /// Reads and checks the 13 tables of the chosen scenes. No picture is opened.
+    ///
+    /// # Errors
+    /// Every broken table, with the file and the row: see [`DataError`]. A split without a scene in these tables is
+    /// [`DataError::Empty`]; `all` may be empty.
+    pub fn open(config: &NuScenesConfig) -> Result<Self, DataError> {
+        if !(config.max_pose_gap_ms >= 0.0) {
+            return Err(DataError::Config(format!(
+                "max_pose_gap_ms must not be negative, but is {}",
+                config.max_pose_gap_ms
+            )));
+        }
+        let base = tables::read_base(config)?;
+        let (pictures, annotations) =
+            rayon::join(|| pictures::read_pictures(config, &base), || annotations::read_annotations(config, &base));
+        let (pictures, annotations) = (pictures?, annotations?);
+        let (rigs, sets, ranges) = sets::group(config, &base, &pictures)?;
+        let root = base.folder.parent().map(ToOwned::to_owned).unwrap_or_default();
+        Ok(Self { config: config.clone(), root, base, pictures, annotations, rigs, sets, ranges })
+    }
+
+    /// The scenes in frame order.
+    pub fn scenes(&self) -> Vec<SceneInfo> {
+        let info = |(scene, frames): (&tables::Scene, &Range<usize>)| SceneInfo {
+            name: scene.name.to_string(),
+            location: scene.location.to_string(),
+            logfile: scene.logfile.to_string(),
+            frames: frames.clone(),
+        };
+        self.base.scenes.iter().zip(&self.ranges).map(info).collect()
+    }
+
+    /// The boxes of a frame with their full rotation, in the world frame. `None`: not annotated.
+    ///
+    /// # Errors
+    /// An index beyond the last frame.
+    pub fn world_boxes(&self, index: usize) -> Result<Option<Vec<WorldBox>>, DataError> {
+        let set = self.set(index)?;
+        Ok(self.boxes_of(set, set.time_ns))
+    }
+
+    /// The boxes at the exposure of one picture by the official rule, which goes by the picture's sample: a key picture has the boxes
+    /// of its sample, any other picture those between that sample and the one before. `None` without annotations or picture, and where `mode` defines none.
+    ///
+    /// # Errors
+    /// An index beyond the last frame.
+    pub fn picture_boxes(&self, index: usize, view: usize, mode: BoxMode) -> Result<Option<Vec<WorldBox>>, DataError> {
+        let set = self.set(index)?;
+        let picture = set.pictures.get(view).copied().flatten().map(|row| &self.pictures.rows[row as usize]);
+        let (Some(annotations), Some(picture)) = (&self.annotations, picture) else { return Ok(None) };
+        let sample = picture.sample as usize;
+        if picture.is_key {
+            return Ok(Some(boxes::at_sample(annotations, &self.base, sample)));
+        }
+        Ok(boxes::before_sample(annotations, &self.base, sample, picture.time_ns, mode))
+    }
+
+    fn set(&self, index: usize) -> Result<&PictureSet, DataError> {
+        self.sets.get(index).ok_or_else(|| {
+            DataError::Config(format!(
+                "frame {index} of {} does not exist, there are {}",
+                self.config.name,
+                self.sets.len()
+            ))
+        })
+    }
+
+    fn boxes_of(&self, set: &PictureSet, time_ns: i64) -> Option<Vec<WorldBox>> {
+        let annotations = self.annotations.as_ref()?;
+        if let Some(sample) = set.sample {
+            return Some(boxes::at_sample(annotations, &self.base, sample as usize));
+        }
+        let FrameChoice::AllPictures { boxes: mode, .. } = self.config.frames else { return None };
+        let samples = self.base.scenes[set.scene as usize].samples.clone();
+        let after =
+            samples.start + self.base.samples[samples.clone()].partition_point(|sample| sample.time_ns < time_ns);
+        // Nothing is defined behind the last sample.
+        if after == samples.end {
+            return None;
+        }
+        boxes::before_sample(annotations, &self.base, after, time_ns, mode)
+    }
+
+    /// The car at an instant. Where no pose row follows (or precedes) within the allowed gap, the nearest row and its own stamp, so that
+    /// stamp and pose always agree and nothing is extrapolated.
+    fn pose_near(&self, scene: u32, time_ns: i64) -> Result<(i64, Rigid), DataError> {
+        let rows = &self.rigs[scene as usize].pose_rows;
+        let pose = |row: &u32| self.pictures.poses[*row as usize];
+        let next = rows.partition_point(|row| pose(row).time_ns < time_ns);
+        let around = &rows[next.saturating_sub(1)..(next + 1).min(rows.len())];
+        let gap_ns = (self.config.max_pose_gap_ms * 1e6) as i64;
+        let track =
+            PoseTrack::new(around.iter().map(|row| (pose(row).time_ns, pose(row).world_from_ego)).collect(), gap_ns);
+        track.at(time_ns).map(|world_from_ego| (time_ns, world_from_ego)).or_else(|source| {
+            let nearest = around.iter().map(pose).min_by_key(|pose| (pose.time_ns - time_ns).abs());
+            match nearest.filter(|pose| (pose.time_ns - time_ns).abs() <= gap_ns) {
+                Some(pose) => Ok((pose.time_ns, pose.world_from_ego)),
+                None => Err(self.no_pose(scene, source)),
+            }
+        })
+    }
+
+    fn no_pose(&self, scene: u32, source: GeometryError) -> DataError {
+        let row = format!("of {}", self.base.scenes[scene as usize].name);
+        DataError::Calibration { row, source, path: self.base.path("ego_pose") }
+    }
+
+    /// Reference instant and pose of a set: the lidar's own pose row at a sample, else between the rows around.
+    fn reference(&self, set: &PictureSet) -> Result<(i64, Rigid), DataError> {
+        let lidar = set.sample.and_then(|sample| self.pictures.lidar_pose[sample as usize]);
+        let lidar = lidar.map(|row| self.pictures.poses[row as usize]);
+        match lidar.filter(|pose| (pose.time_ns - set.time_ns).abs() <= SAME_INSTANT_NS) {
+            Some(pose) => Ok((set.time_ns, pose.world_from_ego)),
+            None => self.pose_near(set.scene, set.time_ns),
+        }
+    }
+
+    fn view(&self, set: &PictureSet, slot: &Slot, picture: Option<u32>, reference: &Rigid) -> Result<View, DataError> {
+        let picture = picture.map(|row| &self.pictures.rows[row as usize]);
+        let (sensor, size) = picture.map_or((slot.sensor, slot.size), |picture| (picture.sensor, picture.size));
+        let (intrinsics, ego_from_cam) = sets::intrinsics(&self.base, sensor, size)
+            .ok_or_else(|| DataError::Config("a picture without a camera".to_owned()))?;
+        let (timestamp_ns, world_from_ego) = match picture {
+            Some(picture) => (picture.time_ns, self.pictures.poses[picture.pose as usize].world_from_ego),
+            // When it would have been taken; its pose only places the camera, so the reference pose serves where no row is near.
+            None => {
+                let expected_ns = set.time_ns + slot.offset_ns;
+                (expected_ns, self.pose_near(set.scene, expected_ns).map_or(*reference, |found| found.1))
+            }
+        };
+        let image = picture.map(|picture| ImageSource::File {
+            path: self.root.join(self.pictures.file_name(picture, &self.base)),
+            size: picture.size,
+        });
+        Ok(View {
+            channel: self.base.channels[slot.channel as usize].to_string(),
+            timestamp_ns,
+            image,
+            mask: None,
+            intrinsics,
+            lens: Lens::Pinhole,
+            ego_from_cam,
+            world_from_ego,
+        })
+    }
+}
+
+impl SceneDataset for NuScenes {
+    fn len(&self) -> usize {
+        self.sets.len()
+    }
+
+    fn frame(&self, index: usize) -> Result<SceneFrame, DataError> {
+        let set = self.set(index)?;
+        let (timestamp_ns, world_from_ego) = self.reference(set)?;
+        let slots = self.rigs[set.scene as usize].slots.iter().zip(&set.pictures);
+        let views = slots.map(|(slot, picture)| self.view(set, slot, *picture, &world_from_ego));
+        let boxes = self.boxes_of(set, timestamp_ns);
+        let boxes = boxes.map(|boxes| boxes.iter().map(|b| b.in_ego(&world_from_ego)).collect::<Vec<ObjectBox>>());
+        let scene = &self.base.scenes[set.scene as usize];
+        Ok(SceneFrame {
+            id: FrameId {
+                dataset: self.config.name.clone(),
+                scene: scene.name.to_string(),
+                frame: set.name(&self.base),
+            },
+            timestamp_ns,
+            world_from_ego,
+            views: views.collect::<Result<_, _>>()?,
+            boxes,
+            scene_text: (!scene.description.is_empty()).then(|| scene.description.to_string()),
+        })
+    }
+
+    fn capabilities(&self) -> Capabilities {
+        Capabilities { boxes: self.annotations.is_some(), text: true, ..Capabilities::default() }
+    }
+
+    fn max_views(&self) -> usize {
+        self.rigs.iter().map(|rig| rig.slots.len()).max().unwrap_or(0)
+    }
+}

@@ -1,0 +1,5 @@
+//! Tests of the data crate that need files, threads or worlds; one binary, because linking is slow.
+
+mod loader;
+mod nuscenes;
+mod writer;

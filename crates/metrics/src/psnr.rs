@@ -1,0 +1,126 @@
+//! Peak signal-to-noise ratio, data range 1: `10 log10(1 / mse)` per image, then the mean over images.
+
+use serde::{Deserialize, Serialize};
+
+use crate::displayed;
+
+/// Peak signal-to-noise ratio in dB of a mean squared error on the [0, 1] scale; infinite for zero.
+#[must_use]
+pub fn psnr_db(mse: f64) -> f64 {
+    -10.0 * mse.log10()
+}
+
+/// Mean squared difference over all pixels and channels of one image, in any memory order.
+///
+/// # Panics
+/// When the lengths differ or are zero.
+#[must_use]
+pub fn image_mse(prediction: &[f32], target: &[f32]) -> f64 {
+    assert_eq!(prediction.len(), target.len(), "values of prediction and target");
+    assert!(!target.is_empty(), "an image without pixels has no error");
+    let squares = prediction.iter().zip(target).map(|(&p, &t)| (displayed(p) - displayed(t)).powi(2));
+    squares.sum::<f64>() / target.len() as f64
+}
+
+/// Collects the PSNR of images one at a time.
+///
+/// Images may come in any order and be split over any number of collectors that are [merged](Psnr::merge): the result
+/// is the same to the last bit, because the values are summed in sorted order at the end.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Psnr {
+    /// dB per image, identical images left out.
+    values_db: Vec<f64>,
+    identical: usize,
+}
+
+/// Mean PSNR of a set of images.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PsnrSummary {
+    /// Mean over the images that differ from their target; `None` when there is none.
+    pub mean_db: Option<f64>,
+    /// Images seen, identical ones included.
+    pub images: usize,
+    /// Images equal to their target. Their PSNR is infinite, so they are counted here and left out of the mean.
+    pub identical: usize,
+}
+
+impl Psnr {
+    /// Adds one image and returns its PSNR in dB.
+    ///
+    /// # Panics
+    /// When the lengths differ or are zero.
+    pub fn update(&mut self, prediction: &[f32], target: &[f32]) -> f64 {
+        let db = psnr_db(image_mse(prediction, target));
+        if db == f64::INFINITY {
+            self.identical += 1;
+        } else {
+            self.values_db.push(db);
+        }
+        db
+    }
+
+    /// Adds every image of another collector.
+    pub fn merge(&mut self, other: Self) {
+        self.values_db.extend(other.values_db);
+        self.identical += other.identical;
+    }
+
+    /// The result so far.
+    #[must_use]
+    pub fn summary(&self) -> PsnrSummary {
+        let mut sorted = self.values_db.clone();
+        sorted.sort_by(f64::total_cmp);
+        let mean_db = (!sorted.is_empty()).then(|| sorted.iter().sum::<f64>() / sorted.len() as f64);
+        PsnrSummary { mean_db, images: sorted.len() + self.identical, identical: self.identical }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn known_errors() {
+        assert_eq!(psnr_db(1.0), 0.0);
+        assert!((psnr_db(0.01) - 20.0).abs() < 1e-12);
+        assert_eq!(psnr_db(0.0), f64::INFINITY);
+        assert_eq!(image_mse(&[0.5, 1.0], &[0.0, 0.5]), 0.25);
+    }
+
+    #[test]
+    fn values_outside_the_range_are_clamped_and_nan_is_kept() {
+        assert_eq!(image_mse(&[7.0, -3.0], &[1.0, 0.0]), 0.0);
+        let mut psnr = Psnr::default();
+        assert!(psnr.update(&[f32::NAN, 0.0], &[0.5, 0.5]).is_nan());
+        assert!(psnr.summary().mean_db.unwrap().is_nan());
+    }
+
+    #[test]
+    fn identical_images_are_counted_apart() {
+        let mut psnr = Psnr::default();
+        assert_eq!(psnr.summary(), PsnrSummary { mean_db: None, images: 0, identical: 0 });
+        assert_eq!(psnr.update(&[0.25; 4], &[0.25; 4]), f64::INFINITY);
+        assert_eq!(psnr.summary(), PsnrSummary { mean_db: None, images: 1, identical: 1 });
+        psnr.update(&[1.0], &[0.0]);
+        psnr.update(&[0.5], &[0.0]);
+        let summary = psnr.summary();
+        assert_eq!((summary.images, summary.identical), (3, 1));
+        assert!((summary.mean_db.unwrap() - 10.0 * 2.0_f64.log10()).abs() < 1e-12, "mean of 0 and 6.02 dB");
+    }
+
+    #[test]
+    fn shards_merge_to_the_same_bits_in_any_order() {
+        let images: Vec<Vec<f32>> = (1..40).map(|i| vec![i as f32 * 0.021, 0.3, 1.0 / i as f32]).collect();
+        let collect = |images: &[Vec<f32>]| {
+            let mut psnr = Psnr::default();
+            images.iter().for_each(|image| _ = psnr.update(image, &[0.5; 3]));
+            psnr
+        };
+        let whole = collect(&images).summary();
+        for split in [0, 1, 17, 38] {
+            let mut merged = collect(&images[split..]);
+            merged.merge(collect(&images[..split]));
+            assert_eq!(merged.summary(), whole);
+        }
+    }
+}

@@ -1,0 +1,194 @@
+//! Affine layers: linear, patch convolutions (stride equal to kernel) and 3-wide convolutions.
+//!
+//! Weights keep PyTorch's layout, so that released files load without transposing and saved files open anywhere.
+
+use burn::module::{Module, Param};
+use burn::tensor::module::{conv2d, conv3d};
+use burn::tensor::ops::ConvOptions;
+use burn::tensor::Tensor;
+
+use crate::Init;
+use crate::layout::{blocks_from_volume, image_from_patches, patches_from_image};
+
+/// `y = x Wᵀ + b` over the last axis.
+#[derive(Module, Debug)]
+pub struct Linear {
+    /// `[out, in]`
+    pub weight: Param<Tensor<2>>,
+    /// `[out]`
+    pub bias: Option<Param<Tensor<1>>>,
+}
+
+/// Whether an affine layer adds a learned offset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bias {
+    /// `x W`
+    Without,
+    /// `x W + b`
+    With,
+}
+
+impl Bias {
+    fn init(self, width: usize, bound: f64, init: &mut Init) -> Option<Param<Tensor<1>>> {
+        (self == Self::With).then(|| init.uniform([width], bound))
+    }
+}
+
+impl Linear {
+    /// Weights and bias U(±1/√in).
+    pub fn new(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
+        let bound = 1.0 / (d_in as f64).sqrt();
+        Self { weight: init.uniform([d_out, d_in], bound), bias: bias.init(d_out, bound, init) }
+    }
+
+    /// # Shapes
+    /// - x: `[.., in]`
+    /// - output: `[.., out]`
+    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        affine(x, self.weight.val().transpose(), self.bias.as_ref().map(Param::val))
+    }
+}
+
+/// `x M + b` with all leading axes folded into one product.
+fn affine<const D: usize>(x: Tensor<D>, matrix: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
+    let mut dims = x.dims();
+    let [d_in, d_out] = matrix.dims();
+    assert_eq!(dims[D - 1], d_in, "last axis of {dims:?} must be {d_in}");
+    let rows = dims[..D - 1].iter().product::<usize>();
+    let y = x.reshape([rows, d_in]).matmul(matrix);
+    let y = match bias {
+        Some(bias) => y + bias.unsqueeze::<2>(),
+        None => y,
+    };
+    dims[D - 1] = d_out;
+    y.reshape(dims)
+}
+
+/// Convolution whose stride equals its kernel: one matrix product over patches.
+#[derive(Module, Debug)]
+pub struct PatchConv2d {
+    /// `[out, in, k, k]`
+    pub weight: Param<Tensor<4>>,
+    /// `[out]`
+    pub bias: Param<Tensor<1>>,
+}
+
+impl PatchConv2d {
+    /// U(±1/√fan_in), fan_in = in·k².
+    pub fn new(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
+        let bound = 1.0 / ((c_in * patch * patch) as f64).sqrt();
+        Self { weight: init.uniform([c_out, c_in, patch, patch], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// # Shapes
+    /// - image: `[B, in, h·k, w·k]`
+    /// - output: `[B, h, w, out]`, channels last
+    pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
+        let weight = self.weight.val();
+        let [c_out, c_in, k, _] = weight.dims();
+        let matrix = weight.reshape([c_out, c_in * k * k]).transpose();
+        affine(patches_from_image(image, k), matrix, Some(self.bias.val()))
+    }
+}
+
+/// Transposed convolution whose stride equals its kernel: one matrix product, then patches are laid side by side.
+#[derive(Module, Debug)]
+pub struct PatchDeconv2d {
+    /// `[in, out, k, k]`
+    pub weight: Param<Tensor<4>>,
+    /// `[out]`
+    pub bias: Param<Tensor<1>>,
+}
+
+impl PatchDeconv2d {
+    /// U(±1/√fan_in) with the framework's fan_in of transposed convolutions, out·k².
+    pub fn new(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
+        let bound = 1.0 / ((c_out * patch * patch) as f64).sqrt();
+        Self { weight: init.uniform([c_in, c_out, patch, patch], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// # Shapes
+    /// - x: `[B, h, w, in]`, channels last
+    /// - output: `[B, out, h·k, w·k]`, channels first
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let weight = self.weight.val();
+        let [c_in, c_out, k, _] = weight.dims();
+        let patches = affine(x, weight.reshape([c_in, c_out * k * k]), None);
+        image_from_patches(patches, k) + self.bias.val().reshape([1, c_out, 1, 1])
+    }
+}
+
+/// 3-D convolution whose stride equals its kernel.
+#[derive(Module, Debug)]
+pub struct PatchConv3d {
+    /// `[out, in, k, k, k]`
+    pub weight: Param<Tensor<5>>,
+    /// `[out]`
+    pub bias: Param<Tensor<1>>,
+}
+
+impl PatchConv3d {
+    /// U(±1/√fan_in), fan_in = in·k³.
+    pub fn new(c_in: usize, c_out: usize, k: usize, init: &mut Init) -> Self {
+        let bound = 1.0 / ((c_in * k * k * k) as f64).sqrt();
+        Self { weight: init.uniform([c_out, c_in, k, k, k], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// # Shapes
+    /// - volume: `[B, in, z·k, y·k, x·k]`
+    /// - output: `[B, z, y, x, out]`, channels last
+    pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
+        let weight = self.weight.val();
+        let [c_out, c_in, k, _, _] = weight.dims();
+        let matrix = weight.reshape([c_out, c_in * k * k * k]).transpose();
+        affine(blocks_from_volume(volume, k), matrix, Some(self.bias.val()))
+    }
+}
+
+/// 3×3 convolution, padding 1, stride 1.
+#[derive(Module, Debug)]
+pub struct Conv3x3 {
+    /// `[out, in, 3, 3]`
+    pub weight: Param<Tensor<4>>,
+    /// `[out]`
+    pub bias: Param<Tensor<1>>,
+}
+
+impl Conv3x3 {
+    /// U(±1/√(9·in)).
+    pub fn new(c_in: usize, c_out: usize, init: &mut Init) -> Self {
+        let bound = 1.0 / ((c_in * 9) as f64).sqrt();
+        Self { weight: init.uniform([c_out, c_in, 3, 3], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// # Shapes
+    /// - image: `[B, in, H, W]`
+    /// - output: `[B, out, H, W]`
+    pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
+        conv2d(image, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1, 1], [1, 1], [1, 1], 1))
+    }
+}
+
+/// 3×3×3 convolution, padding 1, stride 1.
+#[derive(Module, Debug)]
+pub struct Conv3x3x3 {
+    /// `[out, in, 3, 3, 3]`
+    pub weight: Param<Tensor<5>>,
+    /// `[out]`
+    pub bias: Param<Tensor<1>>,
+}
+
+impl Conv3x3x3 {
+    /// U(±1/√(27·in)).
+    pub fn new(c_in: usize, c_out: usize, init: &mut Init) -> Self {
+        let bound = 1.0 / ((c_in * 27) as f64).sqrt();
+        Self { weight: init.uniform([c_out, c_in, 3, 3, 3], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// # Shapes
+    /// - volume: `[B, in, Z, Y, X]`
+    /// - output: `[B, out, Z, Y, X]`
+    pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
+        conv3d(volume, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1; 3], [1; 3], [1; 3], 1))
+    }
+}

@@ -1,0 +1,75 @@
+//! Normalisation layers over `ops`.
+
+use burn::module::{Module, Param};
+use burn::tensor::Tensor;
+
+use crate::Init;
+
+/// Layer norm over the last axis with a gain and without a bias.
+#[derive(Module, Debug)]
+pub struct LayerNorm {
+    /// `[width]`
+    pub weight: Param<Tensor<1>>,
+    epsilon: f32,
+}
+
+impl LayerNorm {
+    /// Gains 1.
+    pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
+        Self { weight: init.constant([width], 1.0), epsilon }
+    }
+
+    /// Shape unchanged.
+    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        ops::layer_norm(x, Some(self.weight.val()), None, self.epsilon)
+    }
+}
+
+/// Root-mean-square norm over the last axis with a gain.
+#[derive(Module, Debug)]
+pub struct RmsNorm {
+    /// `[width]`
+    pub weight: Param<Tensor<1>>,
+    epsilon: f32,
+}
+
+impl RmsNorm {
+    /// Gains 1.
+    pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
+        Self { weight: init.constant([width], 1.0), epsilon }
+    }
+
+    /// Shape unchanged.
+    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        ops::rms_norm(x, self.weight.val(), self.epsilon)
+    }
+}
+
+/// Group norm of `[B, C, ..]` with gain and bias per channel.
+#[derive(Module, Debug)]
+pub struct GroupNorm {
+    /// `[C]`
+    pub weight: Param<Tensor<1>>,
+    /// `[C]`
+    pub bias: Param<Tensor<1>>,
+    groups: usize,
+    epsilon: f32,
+}
+
+impl GroupNorm {
+    /// Gains 1, biases 0. `groups` must divide `channels`; configs check it before they come here.
+    pub fn new(channels: usize, groups: usize, epsilon: f32, init: &mut Init) -> Self {
+        assert_eq!(channels % groups, 0, "{groups} groups must divide {channels} channels");
+        Self { weight: init.constant([channels], 1.0), bias: init.constant([channels], 0.0), groups, epsilon }
+    }
+
+    /// Group norm followed by SiLU, the pair every feature pyramid uses. Shape unchanged.
+    pub fn forward_silu<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        ops::group_norm_silu(x, self.groups, self.weight.val(), self.bias.val(), self.epsilon)
+    }
+
+    /// Shape unchanged.
+    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        ops::group_norm(x, self.groups, self.weight.val(), self.bias.val(), self.epsilon)
+    }
+}

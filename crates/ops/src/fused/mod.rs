@@ -1,0 +1,34 @@
+//! Fused kernels for the CPU backend `flex`: the machinery that makes one a differentiable tensor operation.
+
+mod dispatch;
+mod simd;
+
+pub(crate) use dispatch::{Kernel, fused_1, fused_2, fused_3, on_flex};
+#[cfg(target_arch = "x86_64")]
+pub(crate) use simd::has_avx512;
+pub(crate) use simd::{exp_difference, sum, sum_of_products, vectorized};
+
+use std::cell::Cell;
+
+thread_local! {
+    static COMPOSED_ONLY: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Runs `body` with every operation of this crate composed from burn's own operations, also where a fused kernel exists.
+///
+/// The choice holds for the calling thread and is made on the way forward: a gradient taken later follows it. Meant for
+/// tests, benches and for finding out whether a kernel is to blame.
+pub fn composed_only<R>(body: impl FnOnce() -> R) -> R {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            COMPOSED_ONLY.set(self.0);
+        }
+    }
+    let _restore = Restore(COMPOSED_ONLY.replace(true));
+    body()
+}
+
+fn is_composed_only() -> bool {
+    COMPOSED_ONLY.get()
+}

@@ -1,0 +1,26 @@
+//! Differentiable tensor operations that burn lacks, with kernels per backend.
+//!
+//! Every operation is a composition of burn's tensor operations that runs and differentiates on each backend, and most
+//! have a fused kernel for the CPU backend (`flex`) beside it. Which one runs is decided at run time from the device of
+//! the arguments; both give the same numbers up to rounding. `attention` keeps no table of names: import what you need
+//! from the crate root.
+//!
+//! Shape letters: `N` or `B` batch, `V` views, `Q` queries, `R` rays, `M` heads, `C` channels of one head, `L` levels,
+//! `P` points, `S` sites of all levels, `D H W` (or `Z Y X`) map sizes.
+
+mod activation;
+mod attention;
+mod fused;
+mod norm;
+mod rotary;
+mod sampling;
+
+pub use activation::{gelu, silu};
+pub use attention::attention;
+pub use fused::composed_only;
+pub use norm::{group_norm, group_norm_silu, layer_norm, rms_norm};
+pub use rotary::rotary;
+pub use sampling::{
+    Interpolation, deformable_rays_3d, deformable_sample_2d, deformable_sample_3d, deformable_views_2d, grid_sample_2d,
+    grid_sample_3d,
+};

@@ -1,0 +1,19 @@
+//! BEV-VAE, stage 1: the experiment, its training step and its evaluation.
+
+mod baseline;
+mod evaluate;
+mod experiment;
+mod losses;
+mod step;
+mod task;
+mod viewer;
+
+pub use baseline::MeanPictures;
+pub use evaluate::{Evaluation, Evaluator, Scores};
+pub use experiment::{
+    Adversarial, DataConfig, EvaluationConfig, Experiment, HingeConfig, LossConfig, Optimizers, PerceptualConfig,
+    RunConfig,
+};
+pub use losses::Perceptual;
+pub use task::{BevVaeTask, LoaderSource};
+pub use viewer::{Coded, Viewer, pictures_of};

@@ -1,0 +1,37 @@
+//! Everything but training: data, checks, pictures.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use rigscape::commands::{
+    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, check_data, info, make_data, novel_view,
+    reconstruct, run_main,
+};
+
+/// Multi-camera driving scenes on any camera rig; to train, run train-vae
+#[derive(Debug, Parser)]
+#[command(name = "rigscape", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    MakeData(MakeDataArgs),
+    CheckData(CheckDataArgs),
+    Info(InfoArgs),
+    Reconstruct(ReconstructArgs),
+    NovelView(NovelViewArgs),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    run_main(|| match &cli.command {
+        Command::MakeData(args) => make_data(args),
+        Command::CheckData(args) => check_data(args),
+        Command::Info(args) => info(args),
+        Command::Reconstruct(args) => reconstruct(args),
+        Command::NovelView(args) => novel_view(args),
+    })
+}

@@ -1,0 +1,42 @@
+//! Where host arrays become tensors; nothing before this knows a device, nothing after it a dataset.
+
+use burn::tensor::{Bool, Device, Tensor, TensorData};
+use data::ViewArrays;
+use vae::ViewMatrices;
+
+/// Pictures `[B, V, 3, H, W]`, RGB in [0, 1].
+pub fn pictures(arrays: &ViewArrays, device: &Device) -> Tensor<5> {
+    let shape = [arrays.batch, arrays.views, 3, arrays.height, arrays.width];
+    Tensor::from_data(TensorData::new(arrays.images.clone(), shape), device)
+}
+
+/// `[B, V]`, true where the rig has a camera.
+pub fn view_mask(arrays: &ViewArrays, device: &Device) -> Tensor<2, Bool> {
+    Tensor::from_data(TensorData::new(arrays.mask.clone(), [arrays.batch, arrays.views]), device)
+}
+
+/// Matrices of the cameras that look.
+pub fn encode_cameras(arrays: &ViewArrays, device: &Device) -> ViewMatrices {
+    matrices(arrays, &arrays.img_from_ego, device)
+}
+
+/// Matrices of the cameras that are asked to see.
+pub fn decode_cameras(arrays: &ViewArrays, device: &Device) -> ViewMatrices {
+    matrices(arrays, &arrays.ego_from_img, device)
+}
+
+fn matrices(arrays: &ViewArrays, values: &[f32], device: &Device) -> ViewMatrices {
+    let shape = [arrays.batch, arrays.views, 3, 4];
+    ViewMatrices {
+        matrices: Tensor::from_data(TensorData::new(values.to_vec(), shape), device),
+        view_mask: view_mask(arrays, device),
+    }
+}
+
+/// Network pictures back to RGB in [0, 1] on the host, clamped: one `[3, H, W]` per view, in (sample, view) order.
+pub fn displayed(network: Tensor<5>) -> Vec<Vec<f32>> {
+    let [_, _, c, h, w] = network.dims();
+    let rgb = vae::pixels::denormalise(network).clamp(0.0, 1.0);
+    let values: Vec<f32> = rgb.into_data().iter::<f32>().collect();
+    values.chunks_exact(c * h * w).map(<[f32]>::to_vec).collect()
+}

@@ -1,0 +1,64 @@
+//! Training losses of BEV-VAE (section 5) and the adaptive adversarial weight (section 5.1).
+//!
+//! Image terms are means over the pixels, channels and valid views; the KL is a sum over the latent and a mean over samples.
+
+use burn::tensor::activation::relu;
+use burn::tensor::{Bool, Int, Tensor, TensorData};
+use nn::layout::patches_from_image;
+
+/// Mean squared difference over valid views (item 2).
+///
+/// # Shapes
+/// - decoded, target: `[B, V, 3, H, W]`
+/// - mask: `[B, V]`
+/// - output: `[1]`
+pub fn masked_l2(decoded: Tensor<5>, target: Tensor<5>, mask: Tensor<2, Bool>) -> Tensor<1> {
+    let [b, v, c, h, w] = decoded.dims();
+    let per_view = (decoded - target).square().reshape([b, v, c * h * w]).mean_dim(2).reshape([b, v]);
+    let weights = mask.float();
+    (per_view * weights.clone()).sum() / weights.sum()
+}
+
+/// Hinge loss of the discriminator: mean max(0, 1 − D(x)) + mean max(0, 1 + D(x̂)) (item 5).
+pub fn hinge_discriminator(real: Tensor<1>, fake: Tensor<1>) -> Tensor<1> {
+    relu(1.0 - real).mean() + relu(fake + 1.0).mean()
+}
+
+/// Adversarial loss of the generator: −mean D(x̂) (item 6).
+pub fn adversarial(fake: Tensor<1>) -> Tensor<1> {
+    -fake.mean()
+}
+
+/// The views at the given flat positions (sample · V + view).
+///
+/// # Shapes
+/// - images: `[B, V, 3, H, W]`
+/// - output: `[N, 3, H, W]`
+pub fn select_views(images: Tensor<5>, positions: &[usize]) -> Tensor<4> {
+    let [b, v, c, h, w] = images.dims();
+    let indices: Vec<i64> = positions.iter().map(|p| *p as i64).collect();
+    let count = indices.len();
+    let indices = Tensor::<1, Int>::from_data(TensorData::new(indices, [count]), &images.device());
+    images.reshape([b * v, c, h, w]).select(0, indices)
+}
+
+/// Norm of a loss's gradient over the weight of the last layer, ∇_L = hᵀ·G, without a tape: the last layer is linear per token.
+///
+/// # Shapes
+/// - tokens: `[N, h, w, E]`, entering the last layer
+/// - gradient: `[N, 3, h·k, w·k]`, with respect to the decoded pictures
+/// - output: `[1]`
+pub fn last_layer_gradient_norm(tokens: Tensor<4>, gradient: Tensor<4>) -> Tensor<1> {
+    let [n, h, w, e] = tokens.dims();
+    let patch = gradient.dims()[2] / h;
+    let patches = patches_from_image(gradient, patch);
+    let numbers = patches.dims()[3];
+    let tokens = tokens.reshape([n * h * w, e]);
+    let weight_gradient = tokens.transpose().matmul(patches.reshape([n * h * w, numbers]));
+    weight_gradient.square().sum().sqrt()
+}
+
+/// λ = ‖∇_L L_R‖ / (‖∇_L L_A‖ + 1e-6), clamped to [0, 1e4] (item 7).
+pub fn adaptive_weight(reconstruction_norm: Tensor<1>, adversarial_norm: Tensor<1>) -> Tensor<1> {
+    (reconstruction_norm / (adversarial_norm + 1e-6)).clamp(0.0, 1e4)
+}

@@ -1,0 +1,4 @@
+//! Integration tests of the BEV-VAE crate.
+
+mod golden;
+mod official;
