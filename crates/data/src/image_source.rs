@@ -187,11 +187,33 @@ mod tests {
     #[test]
     fn a_cut_scan_with_an_end_marker_is_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let mut bytes = jpeg_bytes(64, 64);
-        bytes.truncate(bytes.len() * 3 / 5);
-        bytes.extend([0xFF, 0xD9]);
-        let error = source(folder.path(), "patched.jpg", &bytes, (64, 64)).load(&ImageEdit::identity(64, 64));
-        assert!(matches!(error, Err(DataError::Image { .. })), "{error:?}");
+        let bytes = jpeg_bytes(64, 64);
+        let scan = bytes.windows(2).position(|w| w == [0xFF, 0xDA]).unwrap() + 14;
+        for length in (scan..bytes.len() - 40).filter(|length| bytes[length - 1] != 0xFF) {
+            let patched = [&bytes[..length], &[0xFF, 0xD9]].concat();
+            let error = source(folder.path(), "patched.jpg", &patched, (64, 64)).load(&ImageEdit::identity(64, 64));
+            assert!(matches!(error, Err(DataError::Image { .. })), "{length} of {} bytes: {error:?}", bytes.len());
+        }
+    }
+
+    #[test]
+    fn flat_and_grey_pictures_are_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        for (width, height) in [(1, 1), (8, 8), (17, 9), (640, 400)] {
+            let flat = RgbImage::from_pixel(width, height, Rgb([20, 120, 220]));
+            let mut bytes = Vec::new();
+            let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 50);
+            encoder.write_image(flat.as_raw(), width, height, image::ExtendedColorType::Rgb8).unwrap();
+            let picture = source(folder.path(), "flat.jpg", &bytes, (width, height));
+            let loaded = picture.load(&ImageEdit::identity(width, height)).unwrap();
+            assert!(loaded.pixels().all(|pixel| pixel.0.iter().zip([20, 120, 220]).all(|(a, b)| a.abs_diff(b) < 9)));
+            let grey = image::GrayImage::from_pixel(width, height, image::Luma([77]));
+            let path = folder.path().join("grey.jpg");
+            grey.save(&path).unwrap();
+            let loaded =
+                ImageSource::File { path, size: (width, height) }.load(&ImageEdit::identity(width, height)).unwrap();
+            assert!(loaded.pixels().all(|pixel| pixel.0.iter().all(|value| value.abs_diff(77) < 3)));
+        }
     }
 
     #[test]

@@ -15,8 +15,10 @@ use crate::DataError;
 pub(crate) struct JpegOutline {
     /// Width and height in the frame header.
     pub size: (u32, u32),
-    /// Whether the end-of-image marker was reached.
-    pub complete: bool,
+    /// Where the end-of-image marker begins, if it was reached.
+    pub end: Option<usize>,
+    /// Sequential coding in one scan without restart markers, as cameras and encoders write by default.
+    pub plain: bool,
 }
 
 /// True for bytes that begin like a JPEG.
@@ -32,38 +34,36 @@ pub(crate) fn outline(bytes: &[u8], header_only: bool) -> Result<JpegOutline, St
     if !is_jpeg(bytes) {
         return Err("it does not begin like a JPEG".to_owned());
     }
-    let mut size = None;
+    let (mut size, mut sequential, mut scans, mut restarts) = (None, false, 0, false);
     let mut at = 2;
-    loop {
-        let Some((marker, after)) = next_marker(bytes, at) else {
-            let size = size.ok_or("no frame header")?;
-            return Ok(JpegOutline { size, complete: false });
-        };
+    let end = loop {
+        let Some((marker, after)) = next_marker(bytes, at) else { break None };
         at = after;
         match marker {
-            0xD9 => {
-                let size = size.ok_or("no frame header")?;
-                return Ok(JpegOutline { size, complete: true });
-            }
+            0xD9 => break Some(after - 2),
             // Markers without a length: restarts and TEM.
             0xD0..=0xD7 | 0x01 => continue,
+            0xDA => scans += 1,
+            0xDD => restarts = true,
             _ => {}
         }
         let Some(length) = bytes.get(at..at + 2).map(|b| usize::from(b[0]) << 8 | usize::from(b[1])) else {
-            let size = size.ok_or("no frame header")?;
-            return Ok(JpegOutline { size, complete: false });
+            break None;
         };
         // Frame headers are C0..CF without the tables DHT (C4), JPG (C8) and DAC (CC).
         if matches!(marker, 0xC0..=0xCF) && !matches!(marker, 0xC4 | 0xC8 | 0xCC) {
             let header = bytes.get(at + 3..at + 7).ok_or("the frame header is cut off")?;
             let side = |i: usize| u32::from(header[i]) << 8 | u32::from(header[i + 1]);
             size = Some((side(2), side(0)));
+            sequential = marker <= 0xC1;
             if header_only {
-                return Ok(JpegOutline { size: (side(2), side(0)), complete: false });
+                break None;
             }
         }
         at += length.max(2);
-    }
+    };
+    let size = size.ok_or("no frame header")?;
+    Ok(JpegOutline { size, end, plain: sequential && scans == 1 && !restarts })
 }
 
 /// The next marker at or behind `at`, skipping entropy-coded data, stuffed zeros and fill bytes.
@@ -81,6 +81,9 @@ fn next_marker(bytes: &[u8], mut at: usize) -> Option<(u8, usize)> {
     }
 }
 
+/// More than the decoder's bit buffer of eight bytes.
+const READ_AHEAD: usize = 16;
+
 /// All pixels of a complete, sound JPEG as RGB.
 ///
 /// # Errors
@@ -91,15 +94,19 @@ pub(crate) fn decode(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbI
     if outline.size != want {
         return Err(DataError::ImageSize { got: outline.size, want, path: path.to_owned() });
     }
-    if !outline.complete {
+    let Some(end) = outline.end else {
         return Err(bad("the file ends before the end-of-image marker".to_owned()));
-    }
+    };
+    // Behind an end marker the decoder invents zeros for missing data even when strict; without one it complains. A few bytes more than it
+    // reads ahead keep it from complaining about whole pictures.
+    let padded = outline.plain.then(|| [&bytes[..end], &[0; READ_AHEAD]].concat());
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(want.0 as usize)
         .set_max_height(want.1 as usize)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    let mut decoder =
+        zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(padded.as_deref().unwrap_or(bytes)), options);
     let pixels = decoder.decode().map_err(|error| bad(error.to_string()))?;
     let got = pixels.len();
     RgbImage::from_raw(want.0, want.1, pixels)

@@ -48,7 +48,8 @@ pub struct ProceduralConfig {
     pub cameras: Vec<String>,
     /// Every frame's rig is turned about the car's vertical axis by an angle uniform in ± this many degrees.
     pub yaw_jitter_deg: f64,
-    /// Worlds kept in memory; a scene beyond that is generated again when it is asked for again.
+    /// Worlds kept in memory, about half a megabyte each. A shuffled set of more scenes generates most worlds anew for every frame, which
+    /// costs as much as rendering about three 64×64 views.
     pub cached_scenes: usize,
     /// What the worlds hold.
     pub world: WorldConfig,
@@ -64,7 +65,7 @@ impl Default for ProceduralConfig {
             rig: RigSource::Preset(RigPreset::NuScenes),
             cameras: Vec::new(),
             yaw_jitter_deg: 0.0,
-            cached_scenes: 64,
+            cached_scenes: 256,
             world: WorldConfig::default(),
         }
     }

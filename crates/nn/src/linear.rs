@@ -3,9 +3,9 @@
 //! Weights keep PyTorch's layout, so that released files load without transposing and saved files open anywhere.
 
 use burn::module::{Module, Param};
+use burn::tensor::Tensor;
 use burn::tensor::module::{conv2d, conv3d};
 use burn::tensor::ops::ConvOptions;
-use burn::tensor::Tensor;
 
 use crate::Init;
 use crate::layout::{blocks_from_volume, image_from_patches, patches_from_image};

@@ -70,7 +70,7 @@ impl RotaryAttention {
         let [b, n, width] = tokens.dims();
         let head = width / self.heads;
         let qkv = self.qkv.forward(tokens).reshape([b, n, 3, self.heads, head]).permute([2, 0, 3, 1, 4]);
-        let part = |i: usize| qkv.clone().slice([i..i + 1]).reshape([b, self.heads, n, head]);
+        let part = |i: usize| qkv.clone().narrow(0, i, 1).reshape([b, self.heads, n, head]);
         let q = ops::rotary(self.query_norm.forward(part(0)), cos.clone(), sin.clone());
         let k = ops::rotary(self.key_norm.forward(part(1)), cos, sin);
         let attended = ops::attention(q, k, part(2), None);

@@ -90,7 +90,10 @@ mod tests {
     use crate::composed_only;
 
     fn ramp<const R: usize>(shape: [usize; R], device: &Device) -> Tensor<R> {
-        Tensor::<1, burn::tensor::Int>::arange(0..shape.iter().product::<usize>() as i64, device).float().reshape(shape).sin()
+        Tensor::<1, burn::tensor::Int>::arange(0..shape.iter().product::<usize>() as i64, device)
+            .float()
+            .reshape(shape)
+            .sin()
     }
 
     #[test]

@@ -126,9 +126,12 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        for (set, want) in
-            [("sed=7", "sed"), ("inner.3.rate=1", "no entry 3"), ("seed", "key.path=value"), ("seed.x=1", "plain value")]
-        {
+        for (set, want) in [
+            ("sed=7", "sed"),
+            ("inner.3.rate=1", "no entry 3"),
+            ("seed", "key.path=value"),
+            ("seed.x=1", "plain value"),
+        ] {
             let error = format!("{:#}", parse::<Outer>(TEXT, &[set.to_owned()]).unwrap_err());
             assert!(error.contains(want), "{set}: {error}");
         }

@@ -164,15 +164,7 @@ fn paper() -> BevVaeConfig {
 }
 
 fn image(size: usize, channels: usize, heads: usize, blocks: usize) -> ImageConfig {
-    ImageConfig {
-        height: size,
-        width: size,
-        patch: 8,
-        channels,
-        heads,
-        encoder_blocks: blocks,
-        decoder_blocks: blocks,
-    }
+    ImageConfig { height: size, width: size, patch: 8, channels, heads, encoder_blocks: blocks, decoder_blocks: blocks }
 }
 
 fn scene(channels: usize, heads: usize, norm_groups: usize, blocks: usize, points: [usize; 2]) -> SceneConfig {
@@ -262,7 +254,8 @@ impl BevVaeConfig {
         ] {
             divides("scene.norm_groups", s.norm_groups, what, channels)?;
         }
-        for (axis, cells) in ["grid cells along z", "grid cells along y", "grid cells along x"].iter().zip(self.grid.cells)
+        for (axis, cells) in
+            ["grid cells along z", "grid cells along y", "grid cells along x"].iter().zip(self.grid.cells)
         {
             divides("the coarsest pyramid step 4", 4, axis, cells)?;
         }

@@ -8,12 +8,12 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use nn::{Bias, Init, Linear};
 
+use crate::BevVaeConfig;
 use crate::image_coder::{ImageDecoder, ImageEncoder};
 use crate::sample_points::{ViewMatrices, rays_in_grid, voxels_in_views};
 use crate::scene_decoder::SceneDecoder;
 use crate::scene_encoder::SceneEncoder;
 use crate::state_coder::{DiagonalGaussian, StateDecoder, StateEncoder, latent_tokens};
-use crate::BevVaeConfig;
 
 /// Pictures to BEV tokens.
 #[derive(Module, Debug)]

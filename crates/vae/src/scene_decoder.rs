@@ -8,10 +8,10 @@ use burn::tensor::activation::softmax;
 use burn::tensor::{Bool, Tensor};
 use nn::{Bias, Init, LayerNorm, Linear, Mlp, NORM_EPSILON, sincos_3d};
 
+use crate::BevVaeConfig;
 use crate::config::LEVELS;
 use crate::pyramid::ScenePyramid;
 use crate::sample_points::SamplePoints;
-use crate::BevVaeConfig;
 
 /// Logit of a depth outside the grid; finite, so that a ray without any valid depth does not become NaN.
 const MASKED_LOGIT: f64 = -1e30;

@@ -3,14 +3,14 @@
 //! Shapes: B batch, V views, Q voxels, C channels, M heads, L levels, P points, S pyramid pixels.
 
 use burn::module::{Module, Param};
-use burn::tensor::activation::softmax;
 use burn::tensor::Tensor;
+use burn::tensor::activation::softmax;
 use nn::{Bias, Init, LayerNorm, Linear, Mlp, NORM_EPSILON, sincos_3d};
 
+use crate::BevVaeConfig;
 use crate::config::LEVELS;
 use crate::pyramid::ImagePyramid;
 use crate::sample_points::SamplePoints;
-use crate::BevVaeConfig;
 
 /// Deformable attention from voxels into the image pyramids of the views that see them; no value projection.
 #[derive(Module, Debug)]

@@ -23,8 +23,7 @@ const RIG: [(f64, f64, [f64; 3]); 6] = [
 fn camera(index: usize, width: u32, height: u32) -> (Camera, Rigid) {
     let (azimuth, focal, mount) = RIG[index];
     let (sx, sy) = (f64::from(width) / 1600.0, f64::from(height) / 900.0);
-    let intrinsics =
-        Intrinsics { fx: focal * sx, fy: focal * sy, cx: 800.0 * sx, cy: 480.0 * sy, width, height };
+    let intrinsics = Intrinsics { fx: focal * sx, fy: focal * sy, cx: 800.0 * sx, cy: 480.0 * sy, width, height };
     let camera = Camera::new(intrinsics, Lens::Pinhole).expect("sound intrinsics");
     // Columns: the camera's right, down and forward axes in ego.
     let axes = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
@@ -104,7 +103,8 @@ fn main() {
     let first: u64 = value("--first").map_or(0, |v| v.parse().expect("--first takes a number"));
     let seconds: f64 = value("--seconds").map_or(3.0, |v| v.parse().expect("--seconds takes a number"));
     let start = Instant::now();
-    let worlds: Vec<World> = (first..first + seeds).map(|seed| World::generate(seed, &WorldConfig::default())).collect();
+    let worlds: Vec<World> =
+        (first..first + seeds).map(|seed| World::generate(seed, &WorldConfig::default())).collect();
     println!("generate: {:.1} ms per world", start.elapsed().as_secs_f64() * 1e3 / seeds as f64);
     let start = Instant::now();
     for step in 0..200 {

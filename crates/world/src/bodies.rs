@@ -29,10 +29,8 @@ pub struct Kit<'a> {
 impl Kit<'_> {
     /// Adds a part with its centre and half extents in the body's axes.
     pub fn put(&mut self, form: Form, center: Vec3, half: Vec3, look: Look, color: Vec3, accent: Vec3) {
-        let turned = Vec2::new(
-            self.turn.x * center.x - self.turn.y * center.y,
-            self.turn.y * center.x + self.turn.x * center.y,
-        );
+        let turned =
+            Vec2::new(self.turn.x * center.x - self.turn.y * center.y, self.turn.y * center.x + self.turn.x * center.y);
         let shape = Shape { center: self.foot + turned.extend(center.z), turn: self.turn, half, form };
         let (label, instance, salt, lit) = (self.label, self.instance, self.salt, self.lit);
         let surface = Surface { look, color, accent, label, instance, salt, lit };
@@ -230,12 +228,7 @@ fn rider(kit: &mut Kit, seat: Vec3, top: f32, color: Vec3, accent: Vec3) {
     let torso = (top - 0.22 - seat.z) * 0.5;
     let lean = Form::Taper { top: Vec2::new(0.13, 0.19), shift: 0.16 };
     kit.plain(lean, seat + Vec3::Z * torso, Vec3::new(0.14, 0.16, torso), color);
-    kit.plain(
-        Form::Ball,
-        Vec3::new(seat.x + 0.2, 0.0, top - 0.13),
-        Vec3::new(0.13, 0.11, 0.13),
-        accent,
-    );
+    kit.plain(Form::Ball, Vec3::new(seat.x + 0.2, 0.0, top - 0.13), Vec3::new(0.13, 0.11, 0.13), accent);
 }
 
 fn motorcycle(kit: &mut Kit, size: Vec3, color: Vec3, accent: Vec3, with_rider: bool) {

@@ -34,7 +34,8 @@ impl Site<'_> {
         let share = config.building_density.clamp(0.0, 1.0);
         let salt = dice.bits();
         // A scene leans toward one character but mixes in others.
-        let main_character = dice.pick(&[District::Downtown, District::Residential, District::Industrial, District::Residential]);
+        let main_character =
+            dice.pick(&[District::Downtown, District::Residential, District::Industrial, District::Residential]);
         let network = self.network;
         for (index, road) in network.roads.iter().enumerate() {
             for side in [-1.0, 1.0] {
@@ -57,9 +58,15 @@ impl Site<'_> {
     /// Tries one plot and returns how far along the street it reaches.
     fn plot_at(&mut self, dice: &mut Dice, road: usize, s: f64, side: f64, district: District, share: f64) -> f64 {
         let (length, depth, setback, gap) = match district {
-            District::Downtown => (dice.range(12.0, 24.0), dice.range(12.0, 18.0), dice.range(1.8, 4.0), dice.range(0.0, 2.5)),
-            District::Residential => (dice.range(9.0, 14.0), dice.range(7.5, 10.0), dice.range(4.0, 9.0), dice.range(3.0, 9.0)),
-            District::Industrial => (dice.range(20.0, 38.0), dice.range(14.0, 22.0), dice.range(5.0, 14.0), dice.range(5.0, 14.0)),
+            District::Downtown => {
+                (dice.range(12.0, 24.0), dice.range(12.0, 18.0), dice.range(1.8, 4.0), dice.range(0.0, 2.5))
+            }
+            District::Residential => {
+                (dice.range(9.0, 14.0), dice.range(7.5, 10.0), dice.range(4.0, 9.0), dice.range(3.0, 9.0))
+            }
+            District::Industrial => {
+                (dice.range(20.0, 38.0), dice.range(14.0, 22.0), dice.range(5.0, 14.0), dice.range(5.0, 14.0))
+            }
             District::Park => return 22.0,
         };
         let network = self.network;

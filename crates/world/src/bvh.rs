@@ -61,11 +61,8 @@ impl Ray {
         let mut exit = [far; 4];
         for axis in 0..3 {
             let (inverse, offset) = (self.inverse[axis], self.offset[axis]);
-            let (a, b) = if inverse < 0.0 {
-                (&node.high[axis], &node.low[axis])
-            } else {
-                (&node.low[axis], &node.high[axis])
-            };
+            let (a, b) =
+                if inverse < 0.0 { (&node.high[axis], &node.low[axis]) } else { (&node.low[axis], &node.high[axis]) };
             for i in 0..4 {
                 near[i] = larger(a[i] * inverse + offset, near[i]);
                 exit[i] = smaller(b[i] * inverse + offset, exit[i]);
@@ -149,15 +146,15 @@ impl Bvh {
             let node = &self.nodes[first as usize];
             let entries = ray.enter(node, reach);
             let base = depth;
-            for i in 0..4 {
-                if entries[i] < f32::INFINITY && depth < STACK {
+            for (i, entry) in entries.into_iter().enumerate() {
+                if entry < f32::INFINITY && depth < STACK {
                     // Keeps the new part of the stack sorted, nearest on top.
                     let mut at = depth;
-                    while at > base && stack[at - 1].0 < entries[i] {
+                    while at > base && stack[at - 1].0 < entry {
                         stack[at] = stack[at - 1];
                         at -= 1;
                     }
-                    stack[at] = (entries[i], node.first[i], node.count[i]);
+                    stack[at] = (entry, node.first[i], node.count[i]);
                     depth += 1;
                 }
             }
@@ -173,8 +170,8 @@ impl Bvh {
             depth -= 1;
             let node = &self.nodes[stack[depth] as usize];
             let entries = ray.enter(node, far);
-            for i in 0..4 {
-                if entries[i] == f32::INFINITY {
+            for (i, entry) in entries.into_iter().enumerate() {
+                if entry == f32::INFINITY {
                     continue;
                 }
                 if node.count[i] > 0 {
@@ -211,7 +208,8 @@ fn half_area(low: Vec3, high: Vec3) -> f32 {
 /// Adds the node over `items`, whose first shape gets the index `offset`, and all nodes below it; returns its index.
 fn add_node(nodes: &mut Vec<Node>, items: &mut [Item], offset: usize) -> u32 {
     let at = nodes.len();
-    let outside_in = Node { low: [[f32::INFINITY; 4]; 3], high: [[f32::NEG_INFINITY; 4]; 3], first: [0; 4], count: [0; 4] };
+    let outside_in =
+        Node { low: [[f32::INFINITY; 4]; 3], high: [[f32::NEG_INFINITY; 4]; 3], first: [0; 4], count: [0; 4] };
     nodes.push(outside_in);
     // Splits the largest group until there are four.
     let mut groups = vec![(0usize, items.len())];
@@ -295,8 +293,15 @@ mod tests {
     #[test]
     fn the_hierarchy_finds_what_a_plain_search_finds() {
         let number = |i: i32, k: i32| unit(hash2(i, k, 3));
-        let surface =
-            Surface { look: Look::Plain, color: Vec3::ONE, accent: Vec3::ONE, label: 15, instance: 0, salt: 0, lit: false };
+        let surface = Surface {
+            look: Look::Plain,
+            color: Vec3::ONE,
+            accent: Vec3::ONE,
+            label: 15,
+            instance: 0,
+            salt: 0,
+            lit: false,
+        };
         let parts: Vec<_> = (0..300)
             .map(|i| {
                 let center = Vec3::new(number(i, 0) * 40.0, number(i, 1) * 40.0, number(i, 2) * 10.0);
@@ -310,10 +315,8 @@ mod tests {
         for i in 0..2000 {
             let origin = Vec3::new(number(i, 10) * 40.0, number(i, 11) * 40.0, number(i, 12) * 10.0);
             let direction = Vec3::new(number(i, 13) - 0.5, number(i, 14) - 0.5, number(i, 15) - 0.5).normalize();
-            let plain = parts
-                .iter()
-                .filter_map(|(shape, _)| shape.enter(origin, direction, 0.0, 30.0))
-                .min_by(f32::total_cmp);
+            let plain =
+                parts.iter().filter_map(|(shape, _)| shape.enter(origin, direction, 0.0, 30.0)).min_by(f32::total_cmp);
             let ray = Ray::new(origin, direction);
             assert_eq!(bvh.nearest(&ray, 0.0, 30.0).map(|hit| hit.0), plain);
             assert_eq!(bvh.blocked(&ray, 0.0, 30.0), plain.is_some());

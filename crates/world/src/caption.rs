@@ -37,8 +37,8 @@ pub fn caption(conditions: &Conditions, network: &Network, actors: &[Actor]) -> 
     let moving = count(&|a| vehicle(a) && !a.parked && !a.motion.is_still());
     parts.push(match moving {
         0 => "no traffic".into(),
-        1..=6 => "light traffic".into(),
-        7..=16 => "moderate traffic".into(),
+        1..=9 => "light traffic".into(),
+        10..=24 => "moderate traffic".into(),
         _ => "dense traffic".to_string(),
     });
     for (class, word) in [

@@ -85,17 +85,16 @@ impl<'a> Cast<'a> {
     }
 
     fn comes_near(&self, track: &[Option<Footprint>]) -> bool {
-        self.ego_track.iter().enumerate().step_by(8).any(|(i, ego)| {
-            at(track, i).is_some_and(|f| (f.center - ego.center).length_squared() < REACH_M * REACH_M)
-        })
+        self.ego_track
+            .iter()
+            .enumerate()
+            .step_by(8)
+            .any(|(i, ego)| at(track, i).is_some_and(|f| (f.center - ego.center).length_squared() < REACH_M * REACH_M))
     }
 
     fn touches(&self, track: &[Option<Footprint>]) -> bool {
-        let hits_ego = self
-            .ego_track
-            .iter()
-            .enumerate()
-            .any(|(i, ego)| at(track, i).is_some_and(|f| f.overlaps(ego, 0.45)));
+        let hits_ego =
+            self.ego_track.iter().enumerate().any(|(i, ego)| at(track, i).is_some_and(|f| f.overlaps(ego, 0.45)));
         hits_ego
             || self.tracks.iter().any(|other| {
                 (0..track.len().max(other.len())).any(|i| match (at(track, i), at(other, i)) {

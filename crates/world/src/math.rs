@@ -18,7 +18,8 @@ pub fn sin_cos(angle: f64) -> (f64, f64) {
         - x2 / 2.0
             * (1.0
                 - x2 / 12.0
-                    * (1.0 - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0 * (1.0 - x2 / 132.0 * (1.0 - x2 / 182.0))))));
+                    * (1.0
+                        - x2 / 30.0 * (1.0 - x2 / 56.0 * (1.0 - x2 / 90.0 * (1.0 - x2 / 132.0 * (1.0 - x2 / 182.0))))));
     match (quarter as i64).rem_euclid(4) {
         0 => (sin, cos),
         1 => (cos, -sin),
@@ -64,7 +65,10 @@ pub fn atan2_f32(y: f32, x: f32) -> f32 {
     let series = 1.0
         + t2 * (-0.333_331_45
             + t2 * (0.199_935_5
-                + t2 * (-0.142_089 + t2 * (0.106_562_64 + t2 * (-0.075_289_64 + t2 * (0.042_909_614 + t2 * (-0.016_165_737 + t2 * 0.002_866_225_7)))))));
+                + t2 * (-0.142_089
+                    + t2 * (0.106_562_64
+                        + t2 * (-0.075_289_64
+                            + t2 * (0.042_909_614 + t2 * (-0.016_165_737 + t2 * 0.002_866_225_7)))))));
     let mut angle = t * series;
     if ay > ax {
         angle = std::f32::consts::FRAC_PI_2 - angle;
@@ -84,7 +88,8 @@ pub fn fade_exp(x: f32) -> f32 {
 
 /// Integer hash of two lattice coordinates and a salt.
 pub fn hash2(x: i32, y: i32, salt: u32) -> u32 {
-    let mut h = (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77) ^ salt.wrapping_mul(0xC2B2_AE3D);
+    let mut h =
+        (x as u32).wrapping_mul(0x9E37_79B1) ^ (y as u32).wrapping_mul(0x85EB_CA77) ^ salt.wrapping_mul(0xC2B2_AE3D);
     h ^= h >> 15;
     h = h.wrapping_mul(0x2C1B_3C6D);
     h ^= h >> 12;

@@ -164,7 +164,9 @@ fn stripes(dice: &mut Dice, road: &Road) -> Vec<Stripe> {
     let mut out = vec![Stripe { d: 0.0, paint: center }];
     let edge = f64::from(road.lanes) * road.lane_width;
     for side in [-1.0, 1.0] {
-        out.extend((1..road.lanes).map(|i| Stripe { d: side * f64::from(i) * road.lane_width, paint: Paint::DashedWhite }));
+        out.extend(
+            (1..road.lanes).map(|i| Stripe { d: side * f64::from(i) * road.lane_width, paint: Paint::DashedWhite }),
+        );
         if road.parking_width > 0.0 || dice.chance(0.6) {
             out.push(Stripe { d: side * edge, paint: Paint::SolidWhite });
         }

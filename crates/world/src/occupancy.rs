@@ -78,8 +78,8 @@ impl Fill<'_> {
         let half = self.grid.cell_size() * 0.5;
         let reaches = |point: DVec3| {
             let scene = (self.world_from_grid.transform_point(point) - origin).as_vec3();
-            let nearest = shape.local_nearest(shape.to_local(scene - shape.center));
-            let back = (shape.to_scene(nearest) + shape.center).as_dvec3() + origin;
+            let nearest = shape.local_nearest(shape.local_of(scene - shape.center));
+            let back = (shape.scene_of(nearest) + shape.center).as_dvec3() + origin;
             let off = (self.grid_from_world.transform_point(back) - center).abs();
             off.cmple(half + 1e-4).all()
         };

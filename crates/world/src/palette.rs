@@ -53,7 +53,9 @@ impl Palette {
     /// Draws the colours of a scene.
     pub fn draw(dice: &mut Dice) -> Self {
         let tone = dice.range_f32(0.75, 1.35);
-        let asphalt = Vec3::new(0.088, 0.088, 0.092) * tone * Vec3::new(1.0, dice.range_f32(0.94, 1.02), dice.range_f32(0.88, 1.08));
+        let asphalt = Vec3::new(0.088, 0.088, 0.092)
+            * tone
+            * Vec3::new(1.0, dice.range_f32(0.94, 1.02), dice.range_f32(0.88, 1.08));
         let autumn = dice.chance(0.25);
         let dry = dice.range_f32(0.0, 1.0);
         let grass = rgb(92, 128, 56).lerp(rgb(158, 150, 92), dry * 0.8) * dice.range_f32(0.7, 1.1);

@@ -191,9 +191,7 @@ fn stripes(marks: &Marks, a: &Abreast, footing: &Footing) -> (Vec3, f32) {
             Paint::SolidWhite => (Vec3::splat(0.68), line(0.0)),
             Paint::SolidYellow => (Vec3::new(0.72, 0.46, 0.06), line(0.0)),
             Paint::DoubleSolidWhite => (Vec3::splat(0.68), line(DOUBLE_GAP_M) + line(-DOUBLE_GAP_M)),
-            Paint::DoubleSolidYellow => {
-                (Vec3::new(0.72, 0.46, 0.06), line(DOUBLE_GAP_M) + line(-DOUBLE_GAP_M))
-            }
+            Paint::DoubleSolidYellow => (Vec3::new(0.72, 0.46, 0.06), line(DOUBLE_GAP_M) + line(-DOUBLE_GAP_M)),
             Paint::DashedWhite => {
                 let ws = footing.width(a.tangent);
                 let [on, period] = DASH_M;

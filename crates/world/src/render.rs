@@ -39,7 +39,13 @@ impl Snapshot {
         self.render_rows(camera, world_from_cam, options, false)
     }
 
-    fn render_rows(&self, camera: &Camera, world_from_cam: &Rigid, options: &RenderOptions, parallel: bool) -> Rendering {
+    fn render_rows(
+        &self,
+        camera: &Camera,
+        world_from_cam: &Rigid,
+        options: &RenderOptions,
+        parallel: bool,
+    ) -> Rendering {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let (columns, rows) = (width as usize, height as usize);
         let (fx, fy) = (camera.intrinsics.fx.abs(), camera.intrinsics.fy.abs());
@@ -117,7 +123,8 @@ impl Snapshot {
                 let x = 0.5 + step * f64::from(i);
                 x - x.floor()
             };
-            let pixel = DVec2::new(column as f64 + at(0.754_877_666_246_692_7), row as f64 + at(0.569_840_290_998_053_3));
+            let pixel =
+                DVec2::new(column as f64 + at(0.754_877_666_246_692_7), row as f64 + at(0.569_840_290_998_053_3));
             let Some(in_cam) = view.camera.unproject(pixel) else { continue };
             let ray = Ray::new(view.origin, (view.world_from_cam * in_cam).as_vec3());
             let light = match self.trace(&ray, FAR_M) {

@@ -16,7 +16,7 @@ use crate::script::Actor;
 use crate::sky::Sky;
 
 /// Light of a street lamp straight below it, times its height squared.
-const LAMP_POWER: f32 = 26.0;
+const LAMP_POWER: f32 = 42.0;
 
 /// Ground, sky, lamps and all shapes that never move; coordinates are f32 relative to `origin`.
 #[derive(Debug)]

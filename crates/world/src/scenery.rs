@@ -105,7 +105,8 @@ impl<'a> Site<'a> {
         let height = dice.range(6.2, 8.5);
         let step = dice.range(22.0, 30.0);
         let metal = Self::surface(Look::Plain, self.palette.metal, MANMADE, 2);
-        let glow = Surface { accent: self.palette.lamp * 6.0, ..Self::surface(Look::Lamp, Vec3::splat(0.7), MANMADE, 3) };
+        let glow =
+            Surface { accent: self.palette.lamp * 6.0, ..Self::surface(Look::Lamp, Vec3::splat(0.7), MANMADE, 3) };
         for road in &network.roads {
             let mut side = dice.sign();
             let mut s = dice.range(4.0, step);
@@ -173,13 +174,21 @@ impl<'a> Site<'a> {
                 let (s, side) = (dice.range(4.0, road.curve.length() - 4.0), dice.sign());
                 let station = road.curve.at(s);
                 let foot = station.offset(side * (road.half() + network.main().sidewalk_width + 0.25));
-                let [r, g, b] = dice.pick(&[[200, 30, 30], [25, 70, 160], [235, 235, 235], [230, 180, 30], [20, 110, 60]]);
+                let [r, g, b] =
+                    dice.pick(&[[200, 30, 30], [25, 70, 160], [235, 235, 235], [230, 180, 30], [20, 110, 60]]);
                 let (height, width) = (dice.range(2.3, 3.0), dice.range_f32(0.25, 0.45));
                 if !self.clear(foot, 0.5, network.main().sidewalk_width * 0.9) {
                     continue;
                 }
                 let metal = Self::surface(Look::Plain, self.palette.metal, MANMADE, 7);
-                self.put(Form::Cone { top: 0.035 }, foot, height * 0.5, 0.0, Vec3::new(0.035, 0.035, height as f32 * 0.5), metal);
+                self.put(
+                    Form::Cone { top: 0.035 },
+                    foot,
+                    height * 0.5,
+                    0.0,
+                    Vec3::new(0.035, 0.035, height as f32 * 0.5),
+                    metal,
+                );
                 let plate = Self::surface(Look::Plain, rgb(r, g, b), MANMADE, 8);
                 self.put(Form::Block, foot, height, station.heading, Vec3::new(0.04, width, width), plate);
             }
@@ -246,7 +255,8 @@ impl<'a> Site<'a> {
             let height = dice.range(5.0, 9.0) * scale;
             self.put(Form::Cone { top: 0.12 }, at, 0.6, 0.0, Vec3::new(0.16, 0.16, 0.6), trunk);
             for (low, high, radius) in [(0.12, 0.6, 0.24), (0.38, 0.82, 0.18), (0.62, 1.0, 0.12)] {
-                let half = Vec3::new((radius * height) as f32, (radius * height) as f32, (0.5 * (high - low) * height) as f32);
+                let half =
+                    Vec3::new((radius * height) as f32, (radius * height) as f32, (0.5 * (high - low) * height) as f32);
                 self.put(Form::Cone { top: 0.02 }, at, 0.5 * (high + low) * height, 0.0, half, crown);
             }
             return;

@@ -200,9 +200,8 @@ impl Footprint {
         if between.length_squared() > reach * reach {
             return false;
         }
-        let extent = |f: &Self, axis: DVec2| {
-            f.half.x * f.forward.dot(axis).abs() + f.half.y * f.forward.perp().dot(axis).abs()
-        };
+        let extent =
+            |f: &Self, axis: DVec2| f.half.x * f.forward.dot(axis).abs() + f.half.y * f.forward.perp().dot(axis).abs();
         [self.forward, self.forward.perp(), other.forward, other.forward.perp()]
             .into_iter()
             .all(|axis| between.dot(axis).abs() < extent(self, axis) + extent(other, axis) + margin)

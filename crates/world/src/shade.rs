@@ -51,17 +51,12 @@ impl Snapshot {
     fn patch(&self, ray: &Ray, t: f32, met: Met, spread: f32) -> Patch {
         let point = ray.at(t);
         if let Some((shape, surface)) = self.body(met) {
-            let local = shape.to_local(point - shape.center);
+            let local = shape.local_of(point - shape.center);
             let normal = shape.local_normal(local);
-            let scene_normal = shape.to_scene(normal);
+            let scene_normal = shape.scene_of(normal);
             let facing = ray.direction.dot(scene_normal).abs().max(0.15);
-            let look = Look3d {
-                local,
-                normal,
-                height: point.z,
-                pixel: t * spread / facing,
-                lamps: self.scene.sky.lamps,
-            };
+            let look =
+                Look3d { local, normal, height: point.z, pixel: t * spread / facing, lamps: self.scene.sky.lamps };
             let texel = texel(shape, surface, &look);
             return Patch { point, normal: scene_normal, texel, water: 0.0, ground: false };
         }

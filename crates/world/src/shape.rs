@@ -88,12 +88,12 @@ pub struct Shape {
 
 impl Shape {
     /// A vector of the scene in the body's own axes.
-    pub fn to_local(&self, v: Vec3) -> Vec3 {
+    pub fn local_of(&self, v: Vec3) -> Vec3 {
         Vec3::new(self.turn.x * v.x + self.turn.y * v.y, self.turn.x * v.y - self.turn.y * v.x, v.z)
     }
 
     /// A vector of the body's own axes in the scene.
-    pub fn to_scene(&self, v: Vec3) -> Vec3 {
+    pub fn scene_of(&self, v: Vec3) -> Vec3 {
         Vec3::new(self.turn.x * v.x - self.turn.y * v.y, self.turn.y * v.x + self.turn.x * v.y, v.z)
     }
 
@@ -121,11 +121,12 @@ impl Shape {
     /// Distance at which a ray enters the body, if it does so within (near, far). A ray that starts inside does not see it.
     #[inline]
     pub fn enter(&self, origin: Vec3, direction: Vec3, near: f32, far: f32) -> Option<f32> {
-        let o = self.to_local(origin - self.center);
-        let d = self.to_local(direction);
+        let o = self.local_of(origin - self.center);
+        let d = self.local_of(direction);
         let t = match self.form {
             Form::Block => {
-                let inv = Vec3::new(1.0 / d.x, 1.0 / d.y, 1.0 / d.z);
+                // A zero would make 0 * inf; a ray exactly along an axis is common: cars ahead in the own lane.
+                let inv = Vec3::from_array(d.to_array().map(|v| 1.0 / if v.abs() < 1e-9 { 1e-9 } else { v }));
                 let mid = -o * inv;
                 let reach = self.half * inv.abs();
                 let t0 = max3(mid - reach);
@@ -337,11 +338,11 @@ mod tests {
                 hits += 1;
                 let point = origin + direction * t;
                 assert!(point.cmpge(low - 1e-3).all() && point.cmple(high + 1e-3).all(), "{form:?}");
-                let local = body.to_local(point - body.center);
+                let local = body.local_of(point - body.center);
                 assert!((body.local_nearest(local) - local).length() < 2e-3, "{form:?} {local}");
                 let normal = body.local_normal(local);
                 assert!((normal.length() - 1.0).abs() < 1e-3, "{form:?}");
-                assert!(normal.dot(body.to_local(direction)) < 1e-3, "{form:?} {normal}");
+                assert!(normal.dot(body.local_of(direction)) < 1e-3, "{form:?} {normal}");
                 let outside = local + normal * 0.02;
                 assert!((body.local_nearest(outside) - outside).length() > 1e-3, "{form:?} {local} {normal}");
             }
@@ -354,5 +355,13 @@ mod tests {
         let body = shape(Form::Block);
         assert!(body.enter(body.center, Vec3::X, 0.0, 100.0).is_none());
         assert!(body.enter(body.center + Vec3::new(0.0, 0.0, 5.0), Vec3::X, 0.0, 100.0).is_none());
+    }
+
+    /// Regression: a ray exactly along an axis once met only the slabs that it was not parallel to.
+    #[test]
+    fn rays_along_an_axis_meet_the_face() {
+        let body = Shape { center: Vec3::ZERO, turn: Vec2::X, half: Vec3::new(0.5, 0.2, 0.3), form: Form::Block };
+        assert_eq!(body.enter(Vec3::new(-20.0, 0.0, 0.0), Vec3::X, 0.0, 100.0), Some(19.5));
+        assert_eq!(body.enter(Vec3::new(-20.0, 0.25, 0.0), Vec3::X, 0.0, 100.0), None);
     }
 }

@@ -57,7 +57,6 @@ pub fn draw_conditions(dice: &mut Dice, config: &WorldConfig) -> Conditions {
 impl Sky {
     /// The sky of given conditions, with drawn variation.
     pub fn new(dice: &mut Dice, conditions: &Conditions) -> Self {
-        let v = Vec3::new;
         let base = Self {
             sun: conditions.sun_direction.as_vec3(),
             sun_light: Vec3::ZERO,
@@ -73,57 +72,7 @@ impl Sky {
             wet: 0.0,
             salt: dice.bits(),
         };
-        let clear = conditions.weather == Weather::Clear;
-        let mut sky = match (conditions.time_of_day, clear) {
-            (TimeOfDay::Day, true) => Self {
-                sun_light: v(2.5, 2.3, 2.0),
-                ambient: v(0.52, 0.62, 0.78),
-                zenith: v(0.13, 0.29, 0.66) * dice.range_f32(0.8, 1.2),
-                horizon: v(0.62, 0.74, 0.86),
-                glow: v(1.0, 0.9, 0.7),
-                ..base
-            },
-            (TimeOfDay::Day, false) => {
-                let grey = dice.range_f32(0.75, 1.1);
-                Self {
-                    ambient: v(0.98, 1.0, 1.04) * grey,
-                    zenith: v(0.56, 0.59, 0.63) * grey,
-                    horizon: v(0.74, 0.76, 0.79) * grey,
-                    clouds: 1.0,
-                    ..base
-                }
-            }
-            (TimeOfDay::Dusk, true) => Self {
-                sun_light: v(1.7, 0.85, 0.38),
-                ambient: v(0.24, 0.25, 0.36),
-                zenith: v(0.10, 0.15, 0.34),
-                horizon: v(0.50, 0.36, 0.34),
-                glow: v(1.5, 0.62, 0.2),
-                lamps: 0.5,
-                exposure: base.exposure * 1.15,
-                ..base
-            },
-            (TimeOfDay::Dusk, false) => Self {
-                ambient: v(0.26, 0.29, 0.38),
-                zenith: v(0.15, 0.18, 0.25),
-                horizon: v(0.30, 0.31, 0.36),
-                clouds: 1.0,
-                lamps: 0.7,
-                exposure: base.exposure * 1.15,
-                ..base
-            },
-            (TimeOfDay::Night, clear) => Self {
-                sun_light: v(0.02, 0.024, 0.035) * f32::from(u8::from(clear)),
-                ambient: v(0.030, 0.032, 0.045),
-                zenith: v(0.006, 0.009, 0.02),
-                horizon: v(0.05, 0.042, 0.045),
-                clouds: base.clouds * 0.5,
-                haze: base.haze * 1.5,
-                exposure: base.exposure * 1.6,
-                lamps: 1.0,
-                ..base
-            },
-        };
+        let mut sky = base.at_time(dice, conditions);
         if conditions.weather == Weather::Rain {
             let dim = if conditions.time_of_day == TimeOfDay::Night { 1.0 } else { 0.62 };
             sky.ambient *= dim;
@@ -134,6 +83,62 @@ impl Sky {
             sky.lamps = sky.lamps.max(0.35);
         }
         sky
+    }
+
+    /// Light of a time of day under a clear or a grey sky.
+    fn at_time(self, dice: &mut Dice, conditions: &Conditions) -> Self {
+        let v = Vec3::new;
+        let clear = conditions.weather == Weather::Clear;
+        match (conditions.time_of_day, clear) {
+            (TimeOfDay::Day, true) => Self {
+                sun_light: v(2.5, 2.3, 2.0),
+                ambient: v(0.52, 0.62, 0.78),
+                zenith: v(0.13, 0.29, 0.66) * dice.range_f32(0.8, 1.2),
+                horizon: v(0.62, 0.74, 0.86),
+                glow: v(1.0, 0.9, 0.7),
+                ..self
+            },
+            (TimeOfDay::Day, false) => {
+                let grey = dice.range_f32(0.75, 1.1);
+                Self {
+                    ambient: v(0.98, 1.0, 1.04) * grey,
+                    zenith: v(0.56, 0.59, 0.63) * grey,
+                    horizon: v(0.74, 0.76, 0.79) * grey,
+                    clouds: 1.0,
+                    ..self
+                }
+            }
+            (TimeOfDay::Dusk, true) => Self {
+                sun_light: v(1.7, 0.85, 0.38),
+                ambient: v(0.24, 0.25, 0.36),
+                zenith: v(0.10, 0.15, 0.34),
+                horizon: v(0.50, 0.36, 0.34),
+                glow: v(1.5, 0.62, 0.2),
+                lamps: 0.5,
+                exposure: self.exposure * 1.15,
+                ..self
+            },
+            (TimeOfDay::Dusk, false) => Self {
+                ambient: v(0.26, 0.29, 0.38),
+                zenith: v(0.15, 0.18, 0.25),
+                horizon: v(0.30, 0.31, 0.36),
+                clouds: 1.0,
+                lamps: 0.7,
+                exposure: self.exposure * 1.15,
+                ..self
+            },
+            (TimeOfDay::Night, clear) => Self {
+                sun_light: v(0.02, 0.024, 0.035) * f32::from(u8::from(clear)),
+                ambient: v(0.040, 0.042, 0.056),
+                zenith: v(0.006, 0.009, 0.02),
+                horizon: v(0.05, 0.042, 0.045),
+                clouds: self.clouds * 0.5,
+                haze: self.haze * 1.5,
+                exposure: self.exposure * 1.6,
+                lamps: 1.0,
+                ..self
+            },
+        }
     }
 
     /// Whether the sun casts shadows worth a ray.
@@ -191,7 +196,7 @@ impl Sky {
         let mut color = haze.lerp(dark, if tower > ridge { 0.35 } else { 0.45 });
         if self.lamps > 0.3 && tower > ridge {
             let cell = hash2((azimuth * 260.0).floor() as i32, (direction.z * 260.0).floor() as i32, self.salt);
-            if cell % 4 == 0 {
+            if cell.is_multiple_of(4) {
                 color += Vec3::new(0.5, 0.38, 0.2) * (self.lamps * 0.5);
             }
         }
@@ -207,12 +212,10 @@ impl Sky {
 
     /// Linear light to 8 bits: exposure, a shoulder for highlights, a gamma of 2.
     pub fn display(&self, light: Vec3) -> [f32; 3] {
-        (light * self.exposure)
-            .to_array()
-            .map(|c| {
-                let c = c.max(0.0);
-                // Reinhard's curve with a white point of 3.
-                (c * (1.0 + c * (1.0 / 9.0)) / (1.0 + c)).min(1.0).sqrt() * 255.0
-            })
+        (light * self.exposure).to_array().map(|c| {
+            let c = c.max(0.0);
+            // Reinhard's curve with a white point of 3.
+            (c * (1.0 + c * (1.0 / 9.0)) / (1.0 + c)).min(1.0).sqrt() * 255.0
+        })
     }
 }

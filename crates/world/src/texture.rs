@@ -81,7 +81,8 @@ pub fn texel(shape: &Shape, surface: &Surface, at: &Look3d) -> Texel {
         }
         Look::Lamp => {
             // Signals shine by day too.
-            let strength = if surface.color.x > 0.69 && surface.color.z > 0.69 { at.lamps } else { 0.35 + 0.65 * at.lamps };
+            let strength =
+                if surface.color.x > 0.69 && surface.color.z > 0.69 { at.lamps } else { 0.35 + 0.65 * at.lamps };
             Texel { color: surface.color, glow: surface.accent * strength, gloss: 0.0 }
         }
     }
@@ -120,16 +121,16 @@ fn facade(shape: &Shape, surface: &Surface, at: &Look3d) -> Texel {
     let window = mean + (sharp - mean) * fade;
     let wall = surface.color * masonry(surface, at);
     let sill = if shop && y > 0.8 { Vec3::new(pick(6), pick(7), pick(8)) * 0.5 } else { wall };
-    let key = hash2(column, row + 64 * i32::from(at.normal.x.abs() > 0.5) + 128 * i32::from(at.normal.x + at.normal.y > 0.0), surface.salt);
+    let key = hash2(
+        column,
+        row + 64 * i32::from(at.normal.x.abs() > 0.5) + 128 * i32::from(at.normal.x + at.normal.y > 0.0),
+        surface.salt,
+    );
     let pane = surface.accent * (0.5 + unit(key.wrapping_mul(7)));
     let lit = if unit(key) < 0.34 || (shop && unit(key) < 0.7) { 1.0 } else { 0.0 };
     let lit = 0.34 + (lit - 0.34) * fade;
     let warm = Vec3::new(0.95, 0.66, 0.34).lerp(Vec3::new(0.75, 0.85, 1.0), unit(key.wrapping_mul(31)) * 0.6);
-    Texel {
-        color: sill.lerp(pane, window),
-        glow: warm * (window * lit * at.lamps * 0.75),
-        gloss: 0.3 * window,
-    }
+    Texel { color: sill.lerp(pane, window), glow: warm * (window * lit * at.lamps * 0.75), gloss: 0.3 * window }
 }
 
 fn foliage(surface: &Surface, at: &Look3d) -> Texel {
@@ -147,7 +148,7 @@ fn foliage(surface: &Surface, at: &Look3d) -> Texel {
 fn end_lamps(at: &Look3d, half: Vec3, lit: bool, low: f32, high: f32) -> Option<Texel> {
     let z = at.local.z / half.z;
     let y = at.local.y.abs() / half.y;
-    if at.normal.x.abs() < 0.6 || y < 0.56 || y > 0.95 || z < low || z > high {
+    if at.normal.x.abs() < 0.6 || !(0.56..=0.95).contains(&y) || !(low..=high).contains(&z) {
         return None;
     }
     let power = if lit { at.lamps } else { 0.0 };
@@ -169,7 +170,13 @@ fn car_body(shape: &Shape, surface: &Surface, at: &Look3d) -> Texel {
         let grille = at.normal.x > 0.0 && p.y.abs() < half.y * 0.5 && p.z.abs() < half.z * 0.45;
         let bumper = p.z < -half.z * 0.72;
         let plate = p.y.abs() < 0.26 && (p.z + half.z * 0.3).abs() < 0.07;
-        return if plate { Texel { color: Vec3::splat(0.7), ..dark } } else if grille || bumper { dark } else { paint };
+        return if plate {
+            Texel { color: Vec3::splat(0.7), ..dark }
+        } else if grille || bumper {
+            dark
+        } else {
+            paint
+        };
     }
     if at.normal.y.abs() > 0.5 {
         let arch = Vec2::new(p.x.abs() - half.x * 0.62, p.z + half.z - 0.11).length() < 0.42;
@@ -225,10 +232,10 @@ fn bus_body(shape: &Shape, surface: &Surface, at: &Look3d) -> Texel {
 }
 
 fn cargo(shape: &Shape, surface: &Surface, at: &Look3d) -> Texel {
-    if at.normal.x < 0.0 {
-        if let Some(lamp) = end_lamps(at, shape.half, surface.lit, -0.97, -0.82) {
-            return lamp;
-        }
+    if at.normal.x < 0.0
+        && let Some(lamp) = end_lamps(at, shape.half, surface.lit, -0.97, -0.82)
+    {
+        return lamp;
     }
     let along = if at.normal.x.abs() > 0.5 { at.local.y } else { at.local.x };
     let rib = along * 1.6;

@@ -30,7 +30,10 @@ fn profile(dice: &mut Dice, speed: f64) -> Profile {
 /// All actors of a world.
 pub fn populate(cast: &mut Cast, seed: u64, config: &WorldConfig) {
     let density = |value: f64| value.clamp(0.0, 3.0);
-    main_traffic(cast, &mut Dice::new(seed, Purpose::Traffic), density(config.traffic_density));
+    let mut traffic = Dice::new(seed, Purpose::Traffic);
+    // Some streets are nearly empty, some are full.
+    let busy = traffic.range(0.15, 1.25);
+    main_traffic(cast, &mut traffic, density(config.traffic_density) * busy);
     work_zone(cast, &mut Dice::new(seed, Purpose::WorkZone));
     parked(cast, &mut Dice::new(seed, Purpose::Parked), density(config.parked_density));
     people(cast, &mut Dice::new(seed, Purpose::People), density(config.pedestrian_density));
@@ -42,7 +45,11 @@ fn moving_model(dice: &mut Dice, outer_lane: bool) -> Model {
         r if r < 0.68 => ActorClass::Car,
         r if r < 0.80 => ActorClass::Truck,
         r if r < 0.90 => {
-            if outer_lane { ActorClass::Bus } else { ActorClass::Car }
+            if outer_lane {
+                ActorClass::Bus
+            } else {
+                ActorClass::Car
+            }
         }
         _ => ActorClass::Motorcycle,
     };
@@ -115,15 +122,7 @@ fn side_traffic(cast: &mut Cast, dice: &mut Dice, density: f64) {
     }
 }
 
-fn still_on_road(
-    cast: &mut Cast,
-    road: usize,
-    s: f64,
-    d: f64,
-    direction: f64,
-    model: Model,
-    parked: bool,
-) -> bool {
+fn still_on_road(cast: &mut Cast, road: usize, s: f64, d: f64, direction: f64, model: Model, parked: bool) -> bool {
     let station = cast.network().roads[road].curve.at(s);
     let yaw = if direction > 0.0 { station.heading } else { station.heading + PI };
     cast.add(model, Motion::Still { point: station.offset(d), yaw }, parked)
@@ -133,10 +132,10 @@ fn still_on_road(
 fn free_strip(network: &Network, road_index: usize, side: f64, range: [f64; 2]) -> Vec<[f64; 2]> {
     let road = &network.roads[road_index];
     let mut taken: Vec<[f64; 2]> = road.bare.iter().map(|b| [b[0] - 2.0, b[1] + 2.0]).collect();
-    if let (0, Some(park)) = (road_index, &network.carpark) {
-        if park.side == side {
-            taken.push([park.driveway[0] - 2.5, park.driveway[1] + 2.5]);
-        }
+    if let (0, Some(park)) = (road_index, &network.carpark)
+        && park.side == side
+    {
+        taken.push([park.driveway[0] - 2.5, park.driveway[1] + 2.5]);
     }
     Road::without(&taken, range[0].max(3.0), range[1].min(road.curve.length() - 3.0))
 }
@@ -180,7 +179,15 @@ fn work_zone(cast: &mut Cast, dice: &mut Dice) {
     still_on_road(cast, 0, start + dice.range(8.0, 14.0), middle, direction, excavator, true);
     for _ in 0..2 {
         let worker = Model::draw(dice, ActorClass::Pedestrian, false);
-        still_on_road(cast, 0, start + dice.range(1.0, 22.0), middle + side * dice.range(-1.0, 1.0), 1.0, worker, false);
+        still_on_road(
+            cast,
+            0,
+            start + dice.range(1.0, 22.0),
+            middle + side * dice.range(-1.0, 1.0),
+            1.0,
+            worker,
+            false,
+        );
     }
 }
 
@@ -228,7 +235,8 @@ fn parked(cast: &mut Cast, dice: &mut Dice, density: f64) {
 fn carpark_rows(cast: &mut Cast, dice: &mut Dice, park: &Carpark, density: f64) {
     let share = (dice.range(0.35, 0.8) * density).min(0.95);
     let stalls = ((park.s[1] - park.s[0]) / Carpark::STALL_WIDTH) as usize;
-    for (row, d) in [park.d[0] + Carpark::STALL_DEPTH * 0.5, park.d[1] - Carpark::STALL_DEPTH * 0.5].iter().enumerate() {
+    for (row, d) in [park.d[0] + Carpark::STALL_DEPTH * 0.5, park.d[1] - Carpark::STALL_DEPTH * 0.5].iter().enumerate()
+    {
         for stall in 0..stalls {
             let s = park.s[0] + (stall as f64 + 0.5) * Carpark::STALL_WIDTH;
             let before_driveway = row == 0 && s > park.driveway[0] - 1.6 && s < park.driveway[1] + 1.6;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::ObjectClass;
+use crate::{DataError, ObjectClass};
 
 /// Settings of the nuScenes reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -65,6 +65,21 @@ impl NuScenesConfig {
             exclude: Vec::new(),
             name: default_name(),
         }
+    }
+
+    /// # Errors
+    /// [`DataError::Config`] for times that are negative or no numbers.
+    pub(super) fn checked(&self) -> Result<(), DataError> {
+        let window = match self.frames {
+            FrameChoice::KeyFrames => 0.0,
+            FrameChoice::AllPictures { pairing_window_ms, .. } => pairing_window_ms,
+        };
+        for (name, value) in [("max_pose_gap_ms", self.max_pose_gap_ms), ("pairing_window_ms", window)] {
+            if !value.is_finite() || value < 0.0 {
+                return Err(DataError::Config(format!("{name} must not be negative, but is {value}")));
+            }
+        }
+        Ok(())
     }
 }
 

@@ -1,21 +1,16 @@
 //! Streams a table: one JSON array of objects, up to gigabytes, in constant memory and on all cores.
 //!
-//! A scanner that only follows quotes and brackets cuts the file between rows into blocks of about a megabyte; blocks are parsed in
-//! parallel while the next ones are read. No row outlives its block.
+//! [`Blocks`] cuts the file between rows; blocks are parsed in parallel while the next ones are read. No row outlives its block.
 
-use std::fs::File;
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Deserialize;
 use serde::de::{DeserializeSeed, SeqAccess, Visitor};
 
+use super::blocks::{BLOCK, Block, Blocks};
 use super::rows::{Text, Token};
 use crate::DataError;
-
-/// Bytes after which a block is closed at the next border between rows.
-const BLOCK: usize = 1 << 20;
 
 /// A table's row as it stands in the file, borrowing from the block.
 pub(super) trait TableRow {
@@ -61,15 +56,6 @@ where
         Ok(())
     })?;
     Ok(rows)
-}
-
-/// Some rows, rewritten as a JSON array of their own.
-struct Block {
-    bytes: Vec<u8>,
-    /// Position of the first byte in the file.
-    offset: u64,
-    /// An array without rows is allowed only where it is the whole table.
-    whole_table: bool,
 }
 
 impl Block {
@@ -153,172 +139,6 @@ where
             self.seen += 1;
         }
         Ok(())
-    }
-}
-
-/// Cuts a file into blocks.
-struct Blocks {
-    file: File,
-    path: PathBuf,
-    block: usize,
-    /// Read but not yet handed out; begins with `[` or the comma before the next row.
-    buffer: Vec<u8>,
-    offset: u64,
-    scanned: usize,
-    /// The last comma between rows.
-    cut: Option<usize>,
-    depth: u32,
-    in_string: bool,
-    escaped: bool,
-    started: bool,
-    finished: bool,
-}
-
-impl Blocks {
-    fn open(path: &Path, block: usize) -> Result<Self, DataError> {
-        let file = File::open(path).map_err(|source| match source.kind() {
-            std::io::ErrorKind::NotFound => DataError::Missing { what: "table".to_owned(), path: path.to_owned() },
-            _ => DataError::Io { action: "open", source, path: path.to_owned() },
-        })?;
-        Ok(Self {
-            file,
-            path: path.to_owned(),
-            block,
-            buffer: Vec::new(),
-            offset: 0,
-            scanned: 0,
-            cut: None,
-            depth: 0,
-            in_string: false,
-            escaped: false,
-            started: false,
-            finished: false,
-        })
-    }
-
-    fn take(&mut self, count: usize) -> Result<Vec<Block>, DataError> {
-        let mut blocks = Vec::new();
-        while blocks.len() < count && !self.finished {
-            blocks.push(self.next_block()?);
-        }
-        Ok(blocks)
-    }
-
-    fn bad(&self, why: String) -> DataError {
-        DataError::Json { why, path: self.path.clone() }
-    }
-
-    fn next_block(&mut self) -> Result<Block, DataError> {
-        loop {
-            if let Some(end) = self.scan() {
-                self.finished = true;
-                self.only_blanks_behind(end)?;
-                let whole_table = self.offset == 0;
-                let mut bytes = std::mem::take(&mut self.buffer);
-                bytes.truncate(end);
-                bytes[0] = b'[';
-                return Ok(Block { bytes, offset: self.offset, whole_table });
-            }
-            if let Some(cut) = self.cut.filter(|cut| *cut >= self.block) {
-                let rest = self.buffer.split_off(cut);
-                let mut bytes = std::mem::replace(&mut self.buffer, rest);
-                bytes[0] = b'[';
-                bytes.push(b']');
-                let block = Block { bytes, offset: self.offset, whole_table: false };
-                self.offset += cut as u64;
-                self.scanned -= cut;
-                self.cut = None;
-                return Ok(block);
-            }
-            if self.refill()? == 0 {
-                let at = self.offset + self.buffer.len() as u64;
-                return Err(self.bad(format!("the file ends at byte {at}, before the end of its array")));
-            }
-            self.start()?;
-        }
-    }
-
-    fn refill(&mut self) -> Result<usize, DataError> {
-        let wanted = self.block as u64;
-        self.file.by_ref().take(wanted).read_to_end(&mut self.buffer).map_err(|source| DataError::Io {
-            action: "read",
-            source,
-            path: self.path.clone(),
-        })
-    }
-
-    /// Drops blanks before the array and insists on its bracket.
-    fn start(&mut self) -> Result<(), DataError> {
-        if self.started {
-            return Ok(());
-        }
-        let blanks = self.buffer.iter().take_while(|byte| byte.is_ascii_whitespace()).count();
-        match self.buffer.get(blanks) {
-            None => {}
-            Some(b'[') => {
-                // Blanks are kept in front of the bracket: positions stay those of the file.
-                self.buffer[..blanks].fill(b' ');
-                self.buffer.swap(0, blanks);
-                self.started = true;
-            }
-            Some(_) => return Err(self.bad(format!("the table is not an array of rows, at byte {blanks}"))),
-        }
-        Ok(())
-    }
-
-    /// Follows quotes and brackets through new bytes; the position behind the array's closing bracket once it is there.
-    fn scan(&mut self) -> Option<usize> {
-        if !self.started {
-            return None;
-        }
-        while let Some(byte) = self.buffer.get(self.scanned) {
-            let at = self.scanned;
-            self.scanned += 1;
-            if self.in_string {
-                match byte {
-                    _ if self.escaped => self.escaped = false,
-                    b'\\' => self.escaped = true,
-                    b'"' => self.in_string = false,
-                    _ => {}
-                }
-                continue;
-            }
-            match byte {
-                b'"' => self.in_string = true,
-                b'{' | b'[' => self.depth += 1,
-                b'}' | b']' => {
-                    self.depth = self.depth.saturating_sub(1);
-                    if self.depth == 0 {
-                        return Some(self.scanned);
-                    }
-                }
-                b',' if self.depth == 1 => {
-                    self.cut = Some(at);
-                    if at >= self.block {
-                        return None;
-                    }
-                }
-                _ => {}
-            }
-        }
-        None
-    }
-
-    fn only_blanks_behind(&mut self, end: usize) -> Result<(), DataError> {
-        let mut at = self.offset + end as u64;
-        let mut rest = self.buffer[end..].to_vec();
-        loop {
-            if let Some(bad) = rest.iter().position(|byte| !byte.is_ascii_whitespace()) {
-                return Err(self.bad(format!("there is more behind the array, at byte {}", at + bad as u64)));
-            }
-            at += rest.len() as u64;
-            rest.clear();
-            let more = self.file.by_ref().take(BLOCK as u64).read_to_end(&mut rest);
-            let more = more.map_err(|source| DataError::Io { action: "read", source, path: self.path.clone() })?;
-            if more == 0 {
-                return Ok(());
-            }
-        }
     }
 }
 

@@ -4,6 +4,7 @@
 //! calibration. Channel names stay inside this folder. Format: <https://www.nuscenes.org/nuscenes#data-format>, as checked on real files.
 
 mod annotations;
+mod blocks;
 mod boxes;
 mod check;
 mod config;
@@ -66,12 +67,7 @@ impl NuScenes {
     /// Every broken table, with the file and the row: see [`DataError`]. A split without a scene in these tables is
     /// [`DataError::Empty`]; `all` may be empty.
     pub fn open(config: &NuScenesConfig) -> Result<Self, DataError> {
-        if !(config.max_pose_gap_ms >= 0.0) {
-            return Err(DataError::Config(format!(
-                "max_pose_gap_ms must not be negative, but is {}",
-                config.max_pose_gap_ms
-            )));
-        }
+        config.checked()?;
         let base = tables::read_base(config)?;
         let (pictures, annotations) =
             rayon::join(|| pictures::read_pictures(config, &base), || annotations::read_annotations(config, &base));

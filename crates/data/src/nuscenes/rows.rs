@@ -54,7 +54,7 @@ impl<'de> Deserialize<'de> for Stamp {
 
             fn visit_f64<E: Error>(self, value: f64) -> Result<Stamp, E> {
                 // 9.2e15 us is the largest i64 in ns; below it whole microseconds are exact in f64.
-                if !(value.abs() < 9.2e15) {
+                if !value.is_finite() || value.abs() >= 9.2e15 {
                     return Err(E::custom(format!("time stamp {value} is out of range")));
                 }
                 let whole = value.floor();

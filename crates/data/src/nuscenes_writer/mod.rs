@@ -25,7 +25,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
-use world::World;
+use world::{World, WorldConfig};
 
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
 
@@ -70,35 +70,50 @@ pub fn write_nuscenes(
     };
     let mut tables = Tables::with_vocabulary(&tokens);
     add_sensors(&studio, &mut tables);
+    // Maps come first: a map too large for tools is found before hours of rendering. Worlds are made twice because many of them
+    // do not fit into memory at once.
+    let world_config = config.world_config();
     let mut atlas = Atlas::new(&tokens, names.len());
-    let mut scenes = vec![];
-    for (index, name) in names.iter().enumerate() {
-        let world_config = config.world_config();
-        let world = World::generate(tokens.seed("world", name), &world_config);
-        let start_us = FIRST_START_US + index as i64 * HOUR_US;
-        let mut log = log_row(&tokens, name, index);
-        let (location, map_from_world) = atlas.place(&world, &log.token);
-        log.location = location.to_owned();
-        let scene = Scene { name, world: &world, map_from_world, start_us, log };
+    let plans = plan_scenes(&tokens, &names, &world_config, &mut atlas);
+    let mut sha256 = atlas.write(&root, &mut tables)?;
+    for (index, plan) in plans.iter().enumerate() {
+        let world = World::generate(plan.world_seed, &world_config);
+        let mut log = log_row(&tokens, &plan.name, index);
+        log.location.clone_from(&plan.location);
+        let map_from_world = plan.map_from_world.into();
+        let scene = Scene { name: &plan.name, world: &world, map_from_world, start_us: plan.start_us, log };
         studio.write_scene(&scene, &mut tables, &mut advance)?;
-        tracing::debug!(scene = name, location, "scene written");
-        scenes.push(ManifestScene {
+        tracing::debug!(scene = plan.name, location = plan.location, "scene written");
+    }
+    let tables_folder = root.join(&config.version);
+    let digests = tables.write(&tables_folder)?;
+    sha256.extend(digests.into_iter().map(|(name, digest)| (format!("{}/{name}", config.version), digest)));
+    let pictures = tables.sample_data.iter().filter(|row| row.fileformat == "jpg").count();
+    let manifest = manifest(config, plans, pictures, sha256, &root)?;
+    staging.publish()?;
+    Ok(manifest)
+}
+
+/// Gives every scene its world and its place on a map.
+fn plan_scenes(
+    tokens: &TokenSpace,
+    names: &[String],
+    world_config: &WorldConfig,
+    atlas: &mut Atlas<'_>,
+) -> Vec<ManifestScene> {
+    let plan = |(index, name): (usize, &String)| {
+        let world = World::generate(tokens.seed("world", name), world_config);
+        let (location, map_from_world) = atlas.place(&world, &log_row(tokens, name, index).token);
+        ManifestScene {
             name: name.clone(),
             world_seed: world.seed(),
             world_duration_secs: world_config.duration_secs,
             location: location.to_owned(),
             map_from_world: map_from_world.to_array(),
-            start_us,
-        });
-    }
-    let mut sha256 = atlas.write(&root, &mut tables)?;
-    let tables_folder = root.join(&config.version);
-    let digests = tables.write(&tables_folder)?;
-    sha256.extend(digests.into_iter().map(|(name, digest)| (format!("{}/{name}", config.version), digest)));
-    let pictures = tables.sample_data.iter().filter(|row| row.fileformat == "jpg").count();
-    let manifest = manifest(config, scenes, pictures, sha256, &root)?;
-    staging.publish()?;
-    Ok(manifest)
+            start_us: FIRST_START_US + index as i64 * HOUR_US,
+        }
+    };
+    names.iter().enumerate().map(plan).collect()
 }
 
 fn make_folders(studio: &Studio<'_>) -> Result<(), DataError> {

@@ -8,7 +8,7 @@ use image::{GrayImage, ImageFormat};
 use crate::DataError;
 
 const PIXELS_PER_M: f64 = 10.0;
-/// As large as the largest map of the release: 1.2 GB decoded. Devkits need the whole picture in memory.
+/// As large as the largest map of the release: 1.2 GB decoded, which tools hold in memory. About forty worlds of 20 s fit.
 const MOST_PIXELS: f64 = 1.2e9;
 
 /// A polygon: its outer ring and its holes, rings not closed.

@@ -6,7 +6,7 @@ mod simd;
 pub(crate) use dispatch::{Kernel, fused_1, fused_2, fused_3, on_flex};
 #[cfg(target_arch = "x86_64")]
 pub(crate) use simd::has_avx512;
-pub(crate) use simd::{exp_difference, sum, sum_of_products, vectorized};
+pub(crate) use simd::{exp_difference, sum, sum_of_products, sum_of_squares, vectorized};
 
 use std::cell::Cell;
 

@@ -55,51 +55,56 @@ pub(crate) fn has_avx512() -> bool {
         && std::arch::is_x86_feature_detected!("avx512vl")
 }
 
-/// Partial sums kept by reductions: the widest vector, so that no instruction set changes the order of additions.
-const LANES: usize = 16;
+/// Partial sums of a reduction: four vectors of 8, so that long sums are not bound by the latency of one addition.
+const LANES: usize = 32;
+/// Elements of the shorter blocks that follow; 8 channels per head are common.
+const SHORT: usize = 8;
 
+/// Sum of `term(a[i], b[i])` in an order that depends on the length alone.
 #[inline(always)]
-fn fold(mut lanes: [f32; LANES]) -> f32 {
-    let mut width = LANES / 2;
-    while width > 0 {
-        for i in 0..width {
-            lanes[i] += lanes[i + width];
+fn reduce(a: &[f32], b: &[f32], term: impl Fn(f32, f32) -> f32) -> f32 {
+    let ((a_long, a), (b_long, b)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    let mut lanes = [0.0; SHORT];
+    if !a_long.is_empty() {
+        let mut long = [0.0; LANES];
+        for (x, y) in a_long.iter().zip(b_long) {
+            for i in 0..LANES {
+                long[i] += term(x[i], y[i]);
+            }
         }
-        width /= 2;
+        for i in 0..SHORT {
+            lanes[i] = (long[i] + long[i + SHORT]) + (long[i + 2 * SHORT] + long[i + 3 * SHORT]);
+        }
     }
-    lanes[0]
+    let ((a_short, a), (b_short, b)) = (a.as_chunks::<SHORT>(), b.as_chunks::<SHORT>());
+    for (x, y) in a_short.iter().zip(b_short) {
+        for i in 0..SHORT {
+            lanes[i] += term(x[i], y[i]);
+        }
+    }
+    for ((lane, &x), &y) in lanes.iter_mut().zip(a).zip(b) {
+        *lane += term(x, y);
+    }
+    let [a, b, c, d, e, f, g, h] = lanes;
+    ((a + e) + (b + f)) + ((c + g) + (d + h))
 }
 
-/// Sum of `a`, in 16 interleaved partial sums.
+/// Sum of `a`.
 #[inline(always)]
 pub(crate) fn sum(a: &[f32]) -> f32 {
-    let (blocks, rest) = a.as_chunks::<LANES>();
-    let mut lanes = [0.0; LANES];
-    for block in blocks {
-        for i in 0..LANES {
-            lanes[i] += block[i];
-        }
-    }
-    for (lane, &value) in lanes.iter_mut().zip(rest) {
-        *lane += value;
-    }
-    fold(lanes)
+    reduce(a, a, |x, _| x)
 }
 
-/// Sum of `a[i]·b[i]`, in 16 interleaved partial sums.
+/// Sum of `a[i]·b[i]`.
 #[inline(always)]
 pub(crate) fn sum_of_products(a: &[f32], b: &[f32]) -> f32 {
-    let ((a_blocks, a_rest), (b_blocks, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
-    let mut lanes = [0.0; LANES];
-    for (x, y) in a_blocks.iter().zip(b_blocks) {
-        for i in 0..LANES {
-            lanes[i] += x[i] * y[i];
-        }
-    }
-    for ((lane, &x), &y) in lanes.iter_mut().zip(a_rest).zip(b_rest) {
-        *lane += x * y;
-    }
-    fold(lanes)
+    reduce(a, b, |x, y| x * y)
+}
+
+/// Sum of `(a[i] - centre)²`.
+#[inline(always)]
+pub(crate) fn sum_of_squares(a: &[f32], centre: f32) -> f32 {
+    reduce(a, a, |x, _| (x - centre) * (x - centre))
 }
 
 /// `exp(high - low)` for `high ≤ 0` and small `low`, relative error below 2e-7; 0 below -87.

@@ -18,7 +18,13 @@ use crate::fused::{Kernel, fused_3, on_flex, sum, sum_of_products, vectorized};
 /// # Panics
 /// If `groups` does not divide C or the shapes disagree.
 #[must_use]
-pub fn group_norm<const R: usize>(x: Tensor<R>, groups: usize, gain: Tensor<1>, bias: Tensor<1>, eps: f32) -> Tensor<R> {
+pub fn group_norm<const R: usize>(
+    x: Tensor<R>,
+    groups: usize,
+    gain: Tensor<1>,
+    bias: Tensor<1>,
+    eps: f32,
+) -> Tensor<R> {
     apply(x, groups, gain, bias, eps, false)
 }
 

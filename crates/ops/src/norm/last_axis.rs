@@ -15,7 +15,12 @@ use crate::fused::{Kernel, fused_1, fused_2, fused_3, on_flex, sum, sum_of_produ
 /// # Panics
 /// If the shapes disagree.
 #[must_use]
-pub fn layer_norm<const R: usize>(x: Tensor<R>, gain: Option<Tensor<1>>, bias: Option<Tensor<1>>, eps: f32) -> Tensor<R> {
+pub fn layer_norm<const R: usize>(
+    x: Tensor<R>,
+    gain: Option<Tensor<1>>,
+    bias: Option<Tensor<1>>,
+    eps: f32,
+) -> Tensor<R> {
     check_width(&x, gain.as_ref());
     check_width(&x, bias.as_ref());
     if on_flex(&x) {

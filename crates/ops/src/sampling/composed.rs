@@ -98,9 +98,10 @@ fn neighbours(levels: &Levels, level: usize, axis: usize, sampling: &Sampling) -
     let weight = weights.map(|weight| {
         let position = lower.clone() + upper;
         upper += 1.0;
-        let clamped = position.clone().clamp(0.0, last);
-        index.push(clamped.clone().int());
-        weight.mask_fill(position.not_equal(clamped), 0.0)
+        index.push(position.clone().clamp(0.0, last).int());
+        // Two comparisons rather than one with the clamped position: NaN passes both and stays visible.
+        let outside = position.clone().lower_elem(0.0).bool_or(position.greater_elem(last));
+        weight.mask_fill(outside, 0.0)
     });
     let [first, second] = <[_; 2]>::try_from(index).unwrap_or_else(|_| unreachable!("one index per neighbour"));
     Neighbours { index: [first, second], weight }

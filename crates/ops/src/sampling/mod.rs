@@ -12,3 +12,6 @@ mod native;
 
 pub use deformable::{deformable_rays_3d, deformable_sample_2d, deformable_sample_3d, deformable_views_2d};
 pub use grid::{Interpolation, grid_sample_2d, grid_sample_3d};
+
+#[cfg(test)]
+mod tests;

@@ -83,7 +83,10 @@ fn gelu_is_accurate_in_relative_terms() {
         for ((&x, &a), &b) in inputs.iter().zip(&output).zip(expected) {
             // Below about -5 the f64 reference itself loses digits to 1 + erf.
             let relative = ((a as f64 - b) / b).abs();
-            assert!(x < -5.0 || b == 0.0 || relative <= 1e-6, "gelu({x}) = {a}, expected {b}, relative error {relative:e}");
+            assert!(
+                x < -5.0 || b == 0.0 || relative <= 1e-6,
+                "gelu({x}) = {a}, expected {b}, relative error {relative:e}"
+            );
         }
     }
 }

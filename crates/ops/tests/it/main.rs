@@ -1,5 +1,6 @@
-//! Golden tests of the tensor operations on the CPU backend, forward and gradients.
+//! Golden tests of the tensor operations on the CPU backend, and agreement between backends.
 
 mod attention;
+mod backends;
 mod golden;
 mod sampling;

@@ -83,7 +83,8 @@ fn deformable(golden: &Golden, case: &str, sample: impl Fn(Tensor<4>, Tensor<6>,
     let values = golden.leaf::<4>(&format!("{case}/values"));
     let locations = golden.leaf::<6>(&format!("{case}/locations"));
     let logits = golden.leaf::<4>(&format!("{case}/weight_logits"));
-    let weights = activation::softmax(logits.clone(), 3).reshape(<[usize; 5]>::try_from(&locations.dims()[..5]).unwrap());
+    let weights =
+        activation::softmax(logits.clone(), 3).reshape(<[usize; 5]>::try_from(&locations.dims()[..5]).unwrap());
     let output = sample(values.clone(), locations.clone(), weights.clone());
     golden.check(&format!("{case}/output"), output.clone(), OUTPUT);
     let upstream = golden.tensor(&format!("{case}/upstream"));

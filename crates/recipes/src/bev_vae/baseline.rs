@@ -46,12 +46,7 @@ fn key(channel: &str, yaw_deg: f64) -> String {
     format!("{channel}@{yaw_deg}")
 }
 
-fn of_frame(
-    frame: &SceneFrame,
-    size: ImageSize,
-    pose_mode: PoseMode,
-    yaw_deg: &[f64],
-) -> anyhow::Result<MeanImages> {
+fn of_frame(frame: &SceneFrame, size: ImageSize, pose_mode: PoseMode, yaw_deg: &[f64]) -> anyhow::Result<MeanImages> {
     let mut means = MeanImages::default();
     let sample = Sample::load(frame, &SampleOptions { size, pose_mode })?;
     for view in &sample.target {

@@ -9,8 +9,8 @@ use metrics::Psnr;
 use serde::Serialize;
 use vae::BevVae;
 
-use super::viewer::{Coded, Viewer, pictures_of};
 use super::MeanPictures;
+use super::viewer::{Coded, Viewer, pictures_of};
 use crate::sheet::Sheet;
 
 /// Mean PSNR over pictures, and what the baselines reach on the same pictures.

@@ -48,13 +48,7 @@ pub struct Step<'a> {
 
 impl Step<'_> {
     /// Forward and backward; the caller applies the gradients.
-    pub fn run(
-        &self,
-        batch: &SceneBatch,
-        micro: u64,
-        ctx: &StepContext,
-        output: &mut StepOutput,
-    ) -> StepGradients {
+    pub fn run(&self, batch: &SceneBatch, micro: u64, ctx: &StepContext, output: &mut StepOutput) -> StepGradients {
         let stream = |purpose: &str| train::stream(ctx.seed, &format!("{purpose}/{micro}"), ctx.step);
         let (posterior, decoded) = self.forward(batch, &mut stream("posterior"));
         let target = normalise(pictures(&batch.target, self.device));
@@ -72,8 +66,7 @@ impl Step<'_> {
             let positions = choose_views(&batch.target, adversary.views, &mut views);
             if adversary.weight > 0.0 {
                 let tokens = decoded.last_tokens.clone().inner();
-                let (gradient, lambda, score) =
-                    adversarial_gradient(adversary, &images, &upstream, tokens, &positions);
+                let (gradient, lambda, score) = adversarial_gradient(adversary, &images, &upstream, tokens, &positions);
                 upstream = upstream + gradient * (lambda.clone() * adversary.weight).reshape([1, 1, 1, 1, 1]);
                 output.push("lambda", lambda);
                 output.push("adversarial", score);
@@ -153,7 +146,7 @@ fn discriminator_gradients(
     let n = positions.len();
     let fake = select_views(Tensor::from_inner(images), positions);
     let scores = adversary.discriminator.forward(Tensor::cat(vec![select_views(target, positions), fake], 0));
-    let loss = hinge_discriminator(scores.clone().slice([0..n]), scores.slice([n..2 * n]));
+    let loss = hinge_discriminator(scores.clone().narrow(0, 0, n), scores.narrow(0, n, n));
     let value = loss.clone().inner();
     (value, GradientsParams::from_grads(loss.backward(), adversary.discriminator))
 }

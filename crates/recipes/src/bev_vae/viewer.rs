@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
 use data::{
-    ImageSize, PadViews, PoseMode, Sample, SampleOptions, SceneDataset, SceneFrame, ViewArrays, assemble,
-    novel_targets,
+    ImageSize, PadViews, PoseMode, Sample, SampleOptions, SceneDataset, SceneFrame, ViewArrays, assemble, novel_targets,
 };
 use geometry::{CameraRig, wrap_angle};
 use vae::BevVae;
@@ -108,7 +107,9 @@ impl Coded {
     /// Channel and clean picture of each camera that has one, with its position.
     pub fn present(&self) -> impl Iterator<Item = (usize, &str, &[f32])> {
         let named = self.channels.iter().zip(pictures_of(&self.input)).enumerate();
-        named.filter(|(view, _)| self.input.mask[*view]).map(|(view, (channel, picture))| (view, channel.as_str(), picture))
+        named
+            .filter(|(view, _)| self.input.mask[*view])
+            .map(|(view, (channel, picture))| (view, channel.as_str(), picture))
     }
 
     /// Channel of each camera.

@@ -39,7 +39,13 @@ pub fn info(args: &InfoArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.checkpoint {
         let reader = find_checkpoint(path)?;
         let state = reader.state();
-        say(format_args!("{}: step {}, {} batches taken, seed {}", reader.folder().display(), state.step, state.position, state.seed))?;
+        say(format_args!(
+            "{}: step {}, {} batches taken, seed {}",
+            reader.folder().display(),
+            state.step,
+            state.position,
+            state.seed
+        ))?;
         for (name, value) in &state.scalars {
             say(format_args!("  {name} {}", value.map_or_else(|| "not finite".to_owned(), |v| format!("{v:.4}"))))?;
         }
@@ -62,8 +68,9 @@ fn describe(choice: &ModelChoice) -> anyhow::Result<()> {
     let config: &BevVaeConfig = &choice.config;
     let model = BevVae::new(config, &mut Init::new(0, &device));
     let channels = choice.preset.discriminator_channels();
-    let discriminator = Discriminator::new(config.image.height, config.image.width, channels, &mut Init::new(0, &device))
-        .map_or_else(|_| "none fits".to_owned(), |network| network.num_params().to_string());
+    let discriminator =
+        Discriminator::new(config.image.height, config.image.width, channels, &mut Init::new(0, &device))
+            .map_or_else(|_| "none fits".to_owned(), |network| network.num_params().to_string());
     let [rows, columns] = config.state_tokens();
     let [z, y, x] = config.grid.cells;
     say(format_args!(

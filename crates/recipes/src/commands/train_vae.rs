@@ -15,7 +15,11 @@ use crate::config_file;
 
 /// Train BEV-VAE: pictures of any camera rig to one bird's-eye-view latent and back
 #[derive(Debug, Parser)]
-#[command(name = "train-vae", version, after_help = "Example:\n  train-vae --config configs/toy/vae.toml --set train.steps=200")]
+#[command(
+    name = "train-vae",
+    version,
+    after_help = "Example:\n  train-vae --config configs/toy/vae.toml --set train.steps=200"
+)]
 pub struct TrainVaeArgs {
     /// Experiment file (TOML), for example configs/toy/vae.toml
     #[arg(long, value_name = "FILE")]
@@ -81,8 +85,7 @@ pub fn train_vae(args: &TrainVaeArgs) -> anyhow::Result<()> {
         interrupt,
         pause_after: args.stop_after,
     };
-    let outcome =
-        train::train(&mut task, |position| LoaderSource::open(mixture, loader, position), &setup)?;
+    let outcome = train::train(&mut task, |position| LoaderSource::open(mixture, loader, position), &setup)?;
     if outcome.interrupted {
         return Ok(());
     }

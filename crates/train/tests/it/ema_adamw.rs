@@ -92,7 +92,7 @@ fn folder() -> Option<PathBuf> {
     };
     let folder = root.join("ema_adamw");
     if std::env::var_os("RIGSCAPE_GOLDEN").is_none() && !folder.exists() {
-        println!("did not run: no golden `ema_adamw` in tests/golden and RIGSCAPE_GOLDEN is not set");
+        eprintln!("did not run: no golden `ema_adamw` in tests/golden and RIGSCAPE_GOLDEN is not set");
         return None;
     }
     Some(folder)

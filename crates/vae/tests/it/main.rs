@@ -1,4 +1,5 @@
 //! Integration tests of the BEV-VAE crate.
 
+mod behaviour;
 mod golden;
 mod official;

@@ -277,7 +277,8 @@ fn gradients(golden: &Golden, folder: &Path, case: &str, config: &BevVaeConfig, 
         let got = ours.get(name).unwrap_or_else(|| panic!("no gradient for {name}"));
         let l2 = want["l2"].as_f64().unwrap();
         let norm = got.iter().map(|v| v * v).sum::<f64>().sqrt();
-        assert!((norm - l2).abs() <= 1e-3 * l2 + 1e-9, "{case} {name}: gradient norm {norm} against {l2}");
+        // A bias in front of a one-channel group has no gradient but rounding noise, hence the floor.
+        assert!((norm - l2).abs() <= 1e-3 * l2 + 1e-6, "{case} {name}: gradient norm {norm} against {l2}");
         let tolerance = 1e-3 * l2 / (got.len() as f64).sqrt() + 1e-6;
         let probes = want["probe_index"].as_array().unwrap().iter().zip(want["probe_value"].as_array().unwrap());
         for (index, value) in probes {

@@ -178,7 +178,11 @@ fn object_centres_are_where_the_renderer_put_them() {
         let want = DVec2::new(golden["u_px"].as_f64().unwrap(), golden["v_px"].as_f64().unwrap());
         // The golden has integer pixel centres; the tables hold centres rounded to 1 mm in each axis.
         let want = want + DVec2::splat(0.5);
-        assert!((pixel - want).length() < view.intrinsics.fx * 1e-3 / cam.z, "{pixel} instead of {want} in {}", golden["filename"]);
+        assert!(
+            (pixel - want).length() < view.intrinsics.fx * 1e-3 / cam.z,
+            "{pixel} instead of {want} in {}",
+            golden["filename"]
+        );
         let edit = geometry::ImageEdit::identity(3, 3);
         let shift = geometry::ImageEdit { img_from_raw: DMat3::from_translation(-(want.floor() - DVec2::ONE)), ..edit };
         let patch = view.image.as_ref().unwrap().load(&shift).unwrap();

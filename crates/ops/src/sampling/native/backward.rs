@@ -8,8 +8,8 @@ use rayon::prelude::*;
 
 use crate::fused::{sum_of_products, vectorized};
 
-use super::corners::{Corners, position};
-use super::{Deformable, Size, specialize};
+use super::batch::{Batch, POINTS};
+use super::{Deformable, Place, Run, Size, specialize};
 
 /// Tasks wanted, to keep a large machine busy.
 const TASKS: usize = 32;
@@ -82,74 +82,112 @@ fn tasks(kernel: &Deformable) -> Vec<Task> {
 }
 
 vectorized! {
-    fn run[const K: usize, const C: usize](kernel: &Deformable, inputs: &Inputs<'_>, task: Task) -> Part {
-        let size = kernel.size;
-        let c = if C == 0 { size.c } else { C };
-        let axes = kernel.axes;
+    fn run[const K: usize, const W: usize](kernel: &Deformable, inputs: &Inputs<'_>, task: Task) -> Part {
+        let Size { v: views, q: queries, m: heads, c, p, .. } = kernel.size;
         let Task { n, level, head, first, last } = task;
-        let (extent, start, sites) =
-            (kernel.sites.extents[level], kernel.sites.starts[level], kernel.sites.counts[level]);
+        let sites = kernel.sites.counts[level];
         let length = |wanted: bool, length: usize| if wanted { length } else { 0 };
         let mut part = Part {
-            values: vec![0.0; length(inputs.wanted[0], size.v * sites * c)],
-            offsets: vec![0.0; length(inputs.wanted[1], (last - first) * size.p * axes)],
-            weights: vec![0.0; length(inputs.wanted[2], (last - first) * size.p)],
+            values: vec![0.0; length(inputs.wanted[0], views * sites * c)],
+            offsets: vec![0.0; length(inputs.wanted[1], (last - first) * p * kernel.axes)],
+            weights: vec![0.0; length(inputs.wanted[2], (last - first) * p)],
         };
-        let points_wanted = inputs.wanted[1] || inputs.wanted[2];
-        let mut gradient = vec![0.0f32; c];
-        for v in 0..size.v {
-            let view = n * size.v + v;
-            let map = &inputs.values[view * size.s * size.m * c..][..size.s * size.m * c];
-            for &q in kernel.seen.range(view, first, last) {
-                let q = q as usize;
-                let row = n * size.q + q;
-                let upstream = &inputs.upstream[(row * size.m + head) * c..][..c];
-                for i in 0..c {
-                    gradient[i] = upstream[i] * kernel.seen.share[row];
-                }
-                let gradient = &gradient[..c];
-                let reference = &kernel.reference[(view * size.q + q) * axes..][..axes];
-                for p in 0..size.p {
-                    let point = ((row * size.m + head) * kernel.levels() + level) * size.p + p;
-                    let offset = &inputs.offsets[point * axes..][..axes];
-                    let position = position::<K>(reference, offset, extent, kernel.sites.centre);
-                    let Some(corners) = Corners::<K>::new(position, extent) else { continue };
-                    let weight = inputs.weights[point];
-                    if inputs.wanted[0] {
-                        let buffer = &mut part.values[v * sites * c..][..sites * c];
-                        add_to_corners::<K>(buffer, &corners, weight, gradient);
+        let mut batch = Batch::<K>::new();
+        let mut gradient = vec![[0.0; W]; c / W];
+        for v in 0..views {
+            let place = Place { n, v, level, head };
+            let map = kernel.map::<W>(inputs.values, place);
+            let length = length(inputs.wanted[0], sites * c);
+            let (buffer, _) = part.values[v * length..][..length].as_chunks_mut::<W>();
+            for run in kernel.runs(place, first, last) {
+                kernel.fill(&mut batch, inputs.offsets, &run, c / W);
+                let mut corner = [[0.0; POINTS]; K];
+                let mut i = 0;
+                for &q in run.queries {
+                    let row = n * queries + q as usize;
+                    let upstream = inputs.upstream[(row * heads + head) * c..][..c].as_chunks::<W>().0;
+                    for (gradient, upstream) in gradient.iter_mut().zip(upstream) {
+                        *gradient = upstream.map(|x| x * kernel.seen.share[row]);
                     }
-                    if points_wanted {
-                        let corner: [f32; K] = std::array::from_fn(|k| {
-                            let value = &map[((start + corners.site[k]) * size.m + head) * c..][..c];
-                            sum_of_products(gradient, value)
-                        });
-                        let at = (q - first) * size.p + p;
-                        if inputs.wanted[1] {
-                            for a in 0..axes {
-                                part.offsets[at * axes + a] += weight * corners.slope(a, &corner);
-                            }
+                    for &weight in &inputs.weights[kernel.point(&run, q as usize)..][..run.points] {
+                        if inputs.wanted[0] {
+                            add_to_corners(buffer, &batch, i, weight, &gradient);
                         }
-                        if inputs.wanted[2] {
-                            part.weights[at] += sum_of_products(&corners.weight, &corner);
+                        for k in 0..K {
+                            corner[k][i] = product_with_row(map, batch.row[k][i] as usize * heads, &gradient);
                         }
+                        i += 1;
                     }
                 }
+                add_to_points(kernel, &batch, &corner, inputs, &run, first, &mut part.offsets, &mut part.weights);
             }
         }
         part
     }
 }
 
-/// Adds `scale · gradient` to the corners' sites, each by its linear weight.
+/// Gradient times the value at one corner.
 #[inline(always)]
-fn add_to_corners<const K: usize>(buffer: &mut [f32], corners: &Corners<K>, scale: f32, gradient: &[f32]) {
-    let c = gradient.len();
+fn product_with_row<const W: usize>(map: &[[f32; W]], row: usize, gradient: &[[f32; W]]) -> f32 {
+    let mut total = 0.0;
+    for (b, gradient) in gradient.iter().enumerate() {
+        total += sum_of_products(gradient, &map[row + b]);
+    }
+    total
+}
+
+/// Adds `scale · gradient` to the sites of the corners of point `i`, each by its linear weight.
+#[inline(always)]
+fn add_to_corners<const K: usize, const W: usize>(
+    buffer: &mut [[f32; W]],
+    batch: &Batch<K>,
+    i: usize,
+    scale: f32,
+    gradient: &[[f32; W]],
+) {
     for k in 0..K {
-        let weight = corners.weight[k] * scale;
-        let site = &mut buffer[corners.site[k] * c..][..c];
-        for i in 0..c {
-            site[i] += weight * gradient[i];
+        let weight = batch.weight[k][i] * scale;
+        let row = batch.row[k][i] as usize;
+        for (b, gradient) in gradient.iter().enumerate() {
+            let site = &mut buffer[row + b];
+            for j in 0..W {
+                site[j] += weight * gradient[j];
+            }
+        }
+    }
+}
+
+/// Adds the gradients of a run's offsets and weights, given the products of gradient and corner values.
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn add_to_points<const K: usize>(
+    kernel: &Deformable,
+    batch: &Batch<K>,
+    corner: &[[f32; POINTS]; K],
+    inputs: &Inputs<'_>,
+    run: &Run<'_>,
+    first: usize,
+    offsets: &mut [f32],
+    weights: &mut [f32],
+) {
+    let axes = Batch::<K>::AXES;
+    let samples = batch.samples(corner);
+    let slopes: [[f32; POINTS]; 3] =
+        std::array::from_fn(|a| if a < axes { batch.slopes(a, corner) } else { [0.0; POINTS] });
+    let mut i = 0;
+    for &q in run.queries {
+        let weight = &inputs.weights[kernel.point(run, q as usize)..][..run.points];
+        let at = (q as usize - first) * kernel.size.p + run.first;
+        for (j, &weight) in weight.iter().enumerate() {
+            if inputs.wanted[1] {
+                for a in 0..axes {
+                    offsets[(at + j) * axes + a] += weight * slopes[a][i];
+                }
+            }
+            if inputs.wanted[2] {
+                weights[at + j] += samples[i];
+            }
+            i += 1;
         }
     }
 }

@@ -4,11 +4,11 @@ use rayon::prelude::*;
 
 use crate::fused::vectorized;
 
-use super::corners::{Corners, position};
-use super::{Deformable, specialize};
+use super::batch::{Batch, POINTS};
+use super::{Deformable, Place, specialize};
 
 /// Queries per task: enough to make a task worth its start, few enough for many cores.
-const CHUNK: usize = 128;
+const CHUNK: usize = 512;
 
 pub(super) fn forward(kernel: &Deformable, values: &[f32], offsets: &[f32], weights: &[f32]) -> Vec<f32> {
     let width = kernel.size.m * kernel.size.c;
@@ -28,7 +28,7 @@ pub(super) fn forward(kernel: &Deformable, values: &[f32], offsets: &[f32], weig
 
 vectorized! {
     /// Output of the queries that start at `first`, all views of batch item `n`.
-    fn forward_chunk[const K: usize, const C: usize](
+    fn forward_chunk[const K: usize, const W: usize](
         kernel: &Deformable,
         values: &[f32],
         offsets: &[f32],
@@ -38,31 +38,27 @@ vectorized! {
         out: &mut [f32],
     ) {
         let size = kernel.size;
-        let c = if C == 0 { size.c } else { C };
-        let axes = kernel.axes;
-        let points = size.m * kernel.levels() * size.p;
-        let last = first + out.len() / (size.m * c);
+        let blocks = size.c / W;
+        let last = first + out.len() / (size.m * size.c);
+        let (out, _) = out.as_chunks_mut::<W>();
+        let mut batch = Batch::<K>::new();
         for v in 0..size.v {
-            let view = n * size.v + v;
-            let map = &values[view * size.s * size.m * c..][..size.s * size.m * c];
-            for &q in kernel.seen.range(view, first, last) {
-                let q = q as usize;
-                let row = n * size.q + q;
-                let share = kernel.seen.share[row];
-                let reference = &kernel.reference[(view * size.q + q) * axes..][..axes];
-                let out = &mut out[(q - first) * size.m * c..][..size.m * c];
-                let offsets = &offsets[row * points * axes..][..points * axes];
-                let weights = &weights[row * points..][..points];
-                for (m, out) in out.chunks_exact_mut(c).enumerate() {
-                    for (l, &extent) in kernel.sites.extents.iter().enumerate() {
-                        let start = kernel.sites.starts[l];
-                        for p in 0..size.p {
-                            let point = (m * kernel.levels() + l) * size.p + p;
-                            let offset = &offsets[point * axes..][..axes];
-                            let position = position::<K>(reference, offset, extent, kernel.sites.centre);
-                            let Some(corners) = Corners::<K>::new(position, extent) else { continue };
-                            let scale = weights[point] * share;
-                            add_sample::<K>(map, &corners, start, scale, size.m, m, out);
+            for head in 0..size.m {
+                for level in 0..kernel.levels() {
+                    let place = Place { n, v, level, head };
+                    let map = kernel.map::<W>(values, place);
+                    for run in kernel.runs(place, first, last) {
+                        kernel.fill(&mut batch, offsets, &run, size.m * blocks);
+                        let mut i = 0;
+                        for &q in run.queries {
+                            let q = q as usize;
+                            let share = kernel.seen.share[n * size.q + q];
+                            let point = kernel.point(&run, q);
+                            let out = &mut out[((q - first) * size.m + head) * blocks..][..blocks];
+                            for &weight in &weights[point..][..run.points] {
+                                add_sample(map, &batch, i, weight * share, out);
+                                i += 1;
+                            }
                         }
                     }
                 }
@@ -71,25 +67,23 @@ vectorized! {
     }
 }
 
-/// Adds `scale` times the linear sample of head `m` to `out`.
+/// Adds `scale` times the linear sample at point `i` of the batch to the channel blocks `out`.
 #[inline(always)]
-fn add_sample<const K: usize>(
-    map: &[f32],
-    corners: &Corners<K>,
-    start: usize,
+fn add_sample<const K: usize, const W: usize>(
+    map: &[[f32; W]],
+    batch: &Batch<K>,
+    i: usize,
     scale: f32,
-    heads: usize,
-    m: usize,
-    out: &mut [f32],
+    out: &mut [[f32; W]],
 ) {
-    let c = out.len();
-    let rows: [&[f32]; K] = std::array::from_fn(|k| &map[((start + corners.site[k]) * heads + m) * c..][..c]);
-    let weight = corners.weight.map(|weight| weight * scale);
-    for i in 0..c {
-        let mut sum = weight[0] * rows[0][i];
-        for k in 1..K {
-            sum += weight[k] * rows[k][i];
+    debug_assert!(i < POINTS);
+    let weight: [f32; K] = std::array::from_fn(|k| batch.weight[k][i] * scale);
+    for (b, out) in out.iter_mut().enumerate() {
+        for k in 0..K {
+            let value = &map[batch.row[k][i] as usize + b];
+            for j in 0..W {
+                out[j] += weight[k] * value[j];
+            }
         }
-        out[i] += sum;
     }
 }

@@ -1,0 +1,6 @@
+//! Tests across crates: the house's rules, the shipped configs, and the programs as a user runs them.
+
+mod architecture;
+mod configs;
+mod programs;
+mod runs;
