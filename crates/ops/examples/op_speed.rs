@@ -6,7 +6,7 @@
 
 use std::time::Instant;
 
-use burn::tensor::{Bool, Device, Distribution, Tensor, activation, module, ops::ConvOptions};
+use burn::tensor::{Bool, Device, Distribution, Tensor, module, ops::ConvOptions};
 
 fn main() {
     let device = Device::flex();
@@ -143,6 +143,8 @@ fn elementwise(device: &Device) {
 }
 
 fn norms(device: &Device) {
+    let x = normal([2, 4096, 3, 9], device);
+    unary("softmax [2, 4096, 3, 9]", &x, ops::softmax);
     for (rows, width) in [(8192, 24), (896, 128)] {
         let x = normal([rows, width], device);
         let gain = normal([width], device);
@@ -191,7 +193,7 @@ fn attentions(device: &Device) {
     let scores = normal([13, 4, 64, 64], device);
     let product = || drop(q.clone().matmul(k.clone().swap_dims(2, 3)));
     row("  of which q·kᵀ", product, || drop(leaf(&q).matmul(leaf(&k).swap_dims(2, 3)).sum().backward()));
-    unary("  of which softmax", &scores, |x| activation::softmax(x, 3));
+    unary("  of which softmax", &scores, ops::softmax);
 }
 
 /// burn's own convolutions: 3×3 at the discriminator's sizes.

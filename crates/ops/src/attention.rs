@@ -1,6 +1,8 @@
 //! Scaled dot-product attention.
 
-use burn::tensor::{Bool, Tensor, activation};
+use burn::tensor::{Bool, Tensor};
+
+use crate::softmax;
 
 /// Score of a key that may not be attended; far below any real score, and finite so that no row becomes NaN.
 const MASKED_SCORE: f32 = -1e30;
@@ -27,10 +29,10 @@ pub fn attention(q: Tensor<4>, k: Tensor<4>, v: Tensor<4>, mask: Option<Tensor<4
     let scale = 1.0 / (d as f32).sqrt();
     let scores = (q * scale).matmul(k.swap_dims(2, 3));
     let probabilities = match mask {
-        None => activation::softmax(scores, 3),
+        None => softmax(scores),
         Some(mask) => {
             let masked = mask.bool_not().expand([b, h, n, keys]);
-            let probabilities = activation::softmax(scores.mask_fill(masked.clone(), MASKED_SCORE), 3);
+            let probabilities = softmax(scores.mask_fill(masked.clone(), MASKED_SCORE));
             probabilities.mask_fill(masked, 0.0)
         }
     };

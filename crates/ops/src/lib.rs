@@ -2,11 +2,13 @@
 //!
 //! Every operation is a composition of burn's tensor operations that runs and differentiates on each backend, and most
 //! have a fused kernel for the CPU backend (`flex`) beside it. Which one runs is decided at run time from the device of
-//! the arguments; both give the same numbers up to rounding. `attention` keeps no table of names: import what you need
-//! from the crate root.
+//! the arguments; both give the same numbers up to rounding. [`composed_only`] switches the kernels off.
 //!
 //! Shape letters: `N` or `B` batch, `V` views, `Q` queries, `R` rays, `M` heads, `C` channels of one head, `L` levels,
 //! `P` points, `S` sites of all levels, `D H W` (or `Z Y X`) map sizes.
+
+// Kernels index several arrays by one counter; iterators over all of them would hide the arithmetic.
+#![allow(clippy::needless_range_loop)]
 
 mod activation;
 mod attention;
@@ -14,6 +16,7 @@ mod fused;
 mod norm;
 mod rotary;
 mod sampling;
+mod softmax;
 
 pub use activation::{gelu, silu};
 pub use attention::attention;
@@ -24,3 +27,4 @@ pub use sampling::{
     Interpolation, deformable_rays_3d, deformable_sample_2d, deformable_sample_3d, deformable_views_2d, grid_sample_2d,
     grid_sample_3d,
 };
+pub use softmax::softmax;

@@ -1,0 +1,121 @@
+//! Softmax over the last axis.
+
+use burn::tensor::{Tensor, activation};
+use rayon::prelude::*;
+
+use crate::fused::{Kernel, exp_difference, fused_1, on_flex, sum, sum_of_products, vectorized};
+
+/// Softmax over the last axis: `exp(x - max) / Σ exp(x - max)`.
+///
+/// # Shapes
+/// - x and output: `[.., D]`
+#[must_use]
+pub fn softmax<const R: usize>(x: Tensor<R>) -> Tensor<R> {
+    if !on_flex(&x) {
+        return activation::softmax(x, R - 1);
+    }
+    fused_1(Softmax { shape: x.dims().to_vec() }, x)
+}
+
+#[derive(Debug)]
+struct Softmax {
+    shape: Vec<usize>,
+}
+
+/// Elements per task, about.
+const CHUNK: usize = 1 << 13;
+
+impl Softmax {
+    /// Width of a row and elements of a task, at least 1 so that empty tensors need no case of their own.
+    fn sizes(&self) -> (usize, usize) {
+        let width = self.shape.last().copied().unwrap_or(1).max(1);
+        (width, width * CHUNK.div_ceil(width))
+    }
+}
+
+impl Kernel<1> for Softmax {
+    fn output_shape(&self) -> Vec<usize> {
+        self.shape.clone()
+    }
+
+    fn forward(&self, [x]: [&[f32]; 1]) -> Vec<f32> {
+        let (width, chunk) = self.sizes();
+        let mut y = vec![0.0; x.len()];
+        y.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| forward_rows(x, width, y));
+        y
+    }
+
+    fn backward(&self, [x]: [&[f32]; 1], upstream: &[f32], _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
+        let (width, chunk) = self.sizes();
+        let mut dx = vec![0.0; x.len()];
+        let chunks = dx.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).zip(upstream.par_chunks(chunk));
+        chunks.for_each(|((dx, x), upstream)| backward_rows(x, upstream, width, dx));
+        [Some(dx)]
+    }
+}
+
+/// Writes the probabilities of one row.
+#[inline(always)]
+fn probabilities(x: &[f32], y: &mut [f32]) {
+    let largest = x.iter().fold(f32::NEG_INFINITY, |largest, &x| if x > largest { x } else { largest });
+    for (y, &x) in y.iter_mut().zip(x) {
+        *y = exp_difference(x - largest, 0.0);
+    }
+    let scale = 1.0 / sum(y);
+    for y in y {
+        *y *= scale;
+    }
+}
+
+vectorized! {
+    fn forward_rows[](x: &[f32], width: usize, y: &mut [f32]) {
+        for (y, x) in y.chunks_exact_mut(width).zip(x.chunks_exact(width)) {
+            probabilities(x, y);
+        }
+    }
+}
+
+vectorized! {
+    /// `dx = y·(g - Σ g·y)`, the probabilities y computed again rather than kept.
+    fn backward_rows[](x: &[f32], upstream: &[f32], width: usize, dx: &mut [f32]) {
+        let rows = dx.chunks_exact_mut(width).zip(x.chunks_exact(width)).zip(upstream.chunks_exact(width));
+        for ((dx, x), upstream) in rows {
+            probabilities(x, dx);
+            let mean = sum_of_products(dx, upstream);
+            for (dx, &upstream) in dx.iter_mut().zip(upstream) {
+                *dx *= upstream - mean;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, Distribution};
+
+    use super::*;
+    use crate::composed_only;
+
+    #[test]
+    fn kernel_equals_the_composition() {
+        let device = Device::flex().autodiff();
+        for width in [1, 9, 64, 100] {
+            let random = || Tensor::<3>::random([3, 50, width], Distribution::Normal(0.0, 4.0), &device);
+            let (x, upstream) = (random().require_grad(), random());
+            let (fused, composed) = (softmax(x.clone()), composed_only(|| softmax(x.clone())));
+            assert!(fused.clone().all_close(composed.clone(), Some(1e-6), Some(1e-6)));
+            let fused = x.grad(&(fused * upstream.clone()).sum().backward()).unwrap();
+            let composed = x.grad(&(composed * upstream).sum().backward()).unwrap();
+            assert!(fused.all_close(composed, Some(1e-5), Some(2e-6)));
+        }
+    }
+
+    #[test]
+    fn large_and_masked_scores() {
+        let x = Tensor::<2>::from_floats([[1000.0, 1000.0, -1e30], [f32::NEG_INFINITY, 0.0, -200.0]], &Device::flex());
+        let y = softmax(x).into_data().try_to_vec::<f32>().unwrap();
+        assert_eq!(y, [0.5, 0.5, 0.0, 0.0, 1.0, 0.0]);
+        let nan = Tensor::<2>::from_floats([[f32::NAN, 0.0]], &Device::flex());
+        assert!(softmax(nan).into_data().try_to_vec::<f32>().unwrap().iter().all(|y| y.is_nan()));
+    }
+}
