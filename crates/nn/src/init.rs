@@ -44,6 +44,12 @@ impl Init {
         self.parameter(vec![value; shape.iter().product()], shape)
     }
 
+    /// The identity matrix.
+    pub fn diagonal(&mut self, width: usize) -> Param<Tensor<2>> {
+        let values = (0..width * width).map(|i| if i % (width + 1) == 0 { 1.0 } else { 0.0 }).collect();
+        self.parameter(values, [width, width])
+    }
+
     fn parameter<const D: usize>(&self, values: Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
         Param::from_data(TensorData::new(values, shape), &self.device)
     }

@@ -41,6 +41,17 @@ impl Linear {
         Self { weight: init.uniform([d_out, d_in], bound), bias: bias.init(d_out, bound, init) }
     }
 
+    /// Weights and bias 0: the last layer of a residual branch that starts as the identity.
+    pub fn zeros(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
+        let bias = (bias == Bias::With).then(|| init.constant([d_out], 0.0));
+        Self { weight: init.constant([d_out, d_in], 0.0), bias }
+    }
+
+    /// Passes its input through unchanged at the start; no bias.
+    pub fn identity(width: usize, init: &mut Init) -> Self {
+        Self { weight: init.diagonal(width), bias: None }
+    }
+
     /// # Shapes
     /// - x: `[.., in]`
     /// - output: `[.., out]`
@@ -105,6 +116,11 @@ impl PatchDeconv2d {
     pub fn new(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
         let bound = 1.0 / ((c_out * patch * patch) as f64).sqrt();
         Self { weight: init.uniform([c_in, c_out, patch, patch], bound), bias: init.uniform([c_out], bound) }
+    }
+
+    /// Weights and bias 0: a picture that starts as one colour.
+    pub fn zeros(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
+        Self { weight: init.constant([c_in, c_out, patch, patch], 0.0), bias: init.constant([c_out], 0.0) }
     }
 
     /// # Shapes

@@ -25,7 +25,7 @@ impl Mlp {
     pub fn new(width: usize, init: &mut Init) -> Self {
         Self {
             expand: Linear::new(width, 4 * width, Bias::Without, init),
-            contract: Linear::new(4 * width, width, Bias::Without, init),
+            contract: Linear::zeros(4 * width, width, Bias::Without, init),
         }
     }
 
@@ -55,7 +55,7 @@ impl RotaryAttention {
         assert_eq!(width % heads, 0, "{heads} heads must divide width {width}");
         Self {
             qkv: Linear::new(width, 3 * width, Bias::Without, init),
-            out: Linear::new(width, width, Bias::Without, init),
+            out: Linear::zeros(width, width, Bias::Without, init),
             query_norm: RmsNorm::new(width / heads, NORM_EPSILON, init),
             key_norm: RmsNorm::new(width / heads, NORM_EPSILON, init),
             heads,

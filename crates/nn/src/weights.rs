@@ -1,16 +1,14 @@
-//! Named weights: safetensors files, the parameters of a burn module by path, strict loading, seeded initial values.
+//! Named weights: safetensors files, the parameters of a burn module by path and strict loading.
 //!
 //! Everything here works on host tensors. A parameter's path is the field names from the root down, joined by dots
 //! (`blocks.3.attn.proj.weight`; the variant's name stands in the path of an enum).
 
 mod error;
 mod file;
-mod init;
 mod params;
 
 pub use error::{Mismatch, WeightError};
 pub use file::{WeightFile, write_safetensors};
-pub use init::{InitRule, seeded_init};
 pub use params::{fill_params, load_strict, named_params, param_shapes};
 
 /// A tensor on the host, row-major.

@@ -51,8 +51,20 @@ impl ImageDecoder {
         let i = &config.image;
         Self {
             stack: RotaryStack::new(i.channels, i.heads, i.decoder_blocks, init),
-            pixels: PatchDeconv2d::new(i.channels, 3, i.patch, init),
+            pixels: PatchDeconv2d::zeros(i.channels, 3, i.patch, init),
         }
+    }
+
+    /// Starts from pictures of one colour, in network values: with random first pictures the stack first learns to make all
+    /// tokens alike, and takes long to tell them apart again. [our choice]
+    #[must_use]
+    pub fn starting_from(mut self, colour: [f32; 3]) -> Self {
+        self.pixels.bias = self.pixels.bias.map(|bias| {
+            let device = bias.device();
+            let start = Tensor::<1>::from_floats(colour, &device.clone().inner());
+            if device.is_autodiff() { Tensor::from_inner(start).require_grad() } else { start }
+        });
+        self
     }
 
     /// The pictures, and the tokens that enter the last layer.

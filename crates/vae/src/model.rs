@@ -85,6 +85,14 @@ impl BevVae {
         }
     }
 
+    /// Before training: pictures start as this colour, RGB in [0, 1], best the mean of the training data.
+    #[must_use]
+    pub fn starting_from(mut self, rgb: [f32; 3]) -> Self {
+        let colour = std::array::from_fn(|c| (rgb[c] - crate::pixels::MEAN[c]) / crate::pixels::STD[c]);
+        self.decoder.image = self.decoder.image.starting_from(colour);
+        self
+    }
+
     /// The sizes it was built with.
     pub fn config(&self) -> &BevVaeConfig {
         &self.config

@@ -36,6 +36,21 @@ impl MeanPictures {
         Ok(Self(means))
     }
 
+    /// The mean colour over all cameras, RGB in [0, 1]; mid grey when nothing was averaged.
+    pub fn colour(&self) -> [f32; 3] {
+        let pictures: Vec<Vec<f32>> = self.0.views().filter_map(|view| self.0.mean(view)).collect();
+        if pictures.is_empty() {
+            return [0.5; 3];
+        }
+        std::array::from_fn(|c| {
+            let channel = |picture: &Vec<f32>| {
+                let plane = picture.len() / 3;
+                picture[c * plane..(c + 1) * plane].iter().sum::<f32>() / plane as f32
+            };
+            pictures.iter().map(channel).sum::<f32>() / pictures.len() as f32
+        })
+    }
+
     /// The mean picture of a camera of a rig turned by `yaw_deg`; `None` for a camera that training has not seen.
     pub fn of(&self, channel: &str, yaw_deg: f64) -> Option<Vec<f32>> {
         self.0.mean(&key(channel, yaw_deg))

@@ -82,6 +82,11 @@ impl Evaluator {
         Self { datasets, means, yaw_deg, size, pose_mode, device: device.clone() }
     }
 
+    /// Baselines of the training data.
+    pub fn means(&self) -> &MeanPictures {
+        &self.means
+    }
+
     /// Reconstruction alone, on `frames` frames of each dataset (0 for all).
     ///
     /// # Errors

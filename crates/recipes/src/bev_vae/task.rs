@@ -40,7 +40,8 @@ impl BevVaeTask {
     /// # Errors
     /// Sizes that the discriminator cannot take, an unreadable weights file.
     pub fn new(experiment: &Experiment, device: &Device, evaluator: Evaluator) -> anyhow::Result<Self> {
-        let model = BevVae::new(&experiment.model.config, &mut Init::new(experiment.seed, device));
+        let model = BevVae::new(&experiment.model.config, &mut Init::new(experiment.seed, device))
+            .starting_from(evaluator.means().colour());
         let adversary = match &experiment.loss.adversarial {
             Adversarial::Off => None,
             Adversarial::Hinge(config) => {
