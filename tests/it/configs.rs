@@ -25,7 +25,7 @@ fn shipped_configs_are_read_strictly_and_stay_short() {
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.starts_with('#'), "{}: open with what to expect", path.display());
         assert!(
-            text.lines().filter(|line| !line.trim().is_empty()).count() <= 60,
+            text.lines().filter(|line| !line.trim().is_empty()).count() <= 50,
             "{}: differences only",
             path.display()
         );
