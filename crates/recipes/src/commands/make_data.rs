@@ -82,5 +82,5 @@ pub fn make_data(args: &MakeDataArgs) -> anyhow::Result<()> {
         }
     })?;
     let names: Vec<&str> = manifest.scenes.iter().map(|scene| scene.name.as_str()).collect();
-    say(format_args!("{} pictures of {} written to {}", manifest.pictures, names.join(", "), args.out.display()))
+    say(format_args!("{} written to {} (pictures: {})", names.join(", "), args.out.display(), manifest.pictures))
 }
