@@ -13,6 +13,8 @@
 mod activation;
 mod attention;
 mod fused;
+#[cfg(test)]
+mod noise;
 mod norm;
 mod rotary;
 mod sampling;

@@ -91,7 +91,7 @@ vectorized! {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, Distribution};
+    use burn::tensor::Device;
 
     use super::*;
     use crate::composed_only;
@@ -100,13 +100,14 @@ mod tests {
     fn kernel_equals_the_composition() {
         let device = Device::flex().autodiff();
         for width in [1, 9, 64, 100] {
-            let random = || Tensor::<3>::random([3, 50, width], Distribution::Normal(0.0, 4.0), &device);
+            let random = || crate::noise::normal::<3>([3, 50, width], 0.0, 4.0, &device);
             let (x, upstream) = (random().require_grad(), random());
             let (fused, composed) = (softmax(x.clone()), composed_only(|| softmax(x.clone())));
             assert!(fused.clone().all_close(composed.clone(), Some(1e-6), Some(1e-6)));
             let fused = x.grad(&(fused * upstream.clone()).sum().backward()).unwrap();
             let composed = x.grad(&(composed * upstream).sum().backward()).unwrap();
-            assert!(fused.all_close(composed, Some(1e-5), Some(2e-6)));
+            // Differences of upstream values up to 16, so that rounding alone comes to 16 · 1e-7 a term.
+            assert!(fused.all_close(composed, Some(1e-5), Some(1e-5)));
         }
     }
 

@@ -195,7 +195,7 @@ vectorized! {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, Distribution};
+    use burn::tensor::Device;
 
     use super::*;
     use crate::composed_only;
@@ -203,11 +203,11 @@ mod tests {
     #[test]
     fn kernel_equals_the_composition_in_rank_4_and_5() {
         let device = Device::flex().autodiff();
-        let random = |shape: [usize; 4]| Tensor::<4>::random(shape, Distribution::Normal(0.3, 1.5), &device);
+        let random = |shape: [usize; 4]| crate::noise::normal::<4>(shape, 0.3, 1.5, &device);
         for (shape, groups) in [([2, 6, 3, 5], 3), ([3, 8, 7, 16], 2), ([1, 4, 1, 1], 1)] {
             let x = random(shape).require_grad();
             let upstream = random(shape);
-            let parameter = |_| Tensor::<1>::random([shape[1]], Distribution::Normal(0.5, 1.0), &device).require_grad();
+            let parameter = |_| crate::noise::normal::<1>([shape[1]], 0.5, 1.0, &device).require_grad();
             let [gain, bias] = [0, 1].map(parameter);
             for silu in [false, true] {
                 let norm = |x: Tensor<4>| apply(x, groups, gain.clone(), bias.clone(), 1e-5, silu);

@@ -187,13 +187,13 @@ vectorized! {
 
 #[cfg(test)]
 mod tests {
-    use burn::tensor::{Device, Distribution};
+    use burn::tensor::Device;
 
     use super::*;
     use crate::composed_only;
 
     fn random<const R: usize>(shape: [usize; R], device: &Device) -> Tensor<R> {
-        Tensor::random(shape, Distribution::Normal(0.3, 1.5), device)
+        crate::noise::normal(shape, 0.3, 1.5, device)
     }
 
     /// Both sides sum some hundred products in f32.

@@ -1,6 +1,6 @@
 //! Analytic cases, finite differences, kernel against composition, independence of the thread count.
 
-use burn::tensor::{Bool, Device, Distribution, Tensor, TensorData};
+use burn::tensor::{Bool, Device, Tensor, TensorData};
 
 use super::core::{Levels, Sampling, sample_views};
 use super::{deformable_rays_3d, deformable_sample_2d, deformable_views_2d};
@@ -11,11 +11,11 @@ fn device() -> Device {
 }
 
 fn normal<const D: usize>(shape: [usize; D]) -> Tensor<D> {
-    Tensor::random(shape, Distribution::Normal(0.0, 1.0), &device())
+    crate::noise::normal(shape, 0.0, 1.0, &device())
 }
 
 fn uniform<const D: usize>(shape: [usize; D], from: f64, to: f64) -> Tensor<D> {
-    Tensor::random(shape, Distribution::Uniform(from, to), &device())
+    crate::noise::uniform(shape, from, to, &device())
 }
 
 fn constant<const D: usize>(values: &[f32], shape: [usize; D]) -> Tensor<D> {
