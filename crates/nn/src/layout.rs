@@ -34,7 +34,11 @@ pub fn image_from_patches(patches: Tensor<4>, patch: usize) -> Tensor<4> {
 pub fn blocks_from_volume(volume: Tensor<5>, k: usize) -> Tensor<5> {
     let [b, c, depth, height, width] = volume.dims();
     let (z, y, x) = (depth / k, height / k, width / k);
-    volume.reshape([b, c, z, k, y, k, x, k]).permute([0, 2, 4, 6, 1, 3, 5, 7]).reshape([b, z, y, x, c * k * k * k])
+    // One axis at a time: eight axes at once are more than some backends have.
+    let slices = volume.reshape([b, c, z, k, height * width]).permute([0, 2, 1, 3, 4]);
+    let rows = slices.reshape([b * z, c * k, y, k, width]).permute([0, 2, 1, 3, 4]);
+    let blocks = rows.reshape([b * z * y, c * k * k, x, k]).permute([0, 2, 1, 3]);
+    blocks.reshape([b, z, y, x, c * k * k * k])
 }
 
 /// `[B, C, H, W]` to `[B, H, W, C]`.

@@ -101,8 +101,8 @@ fn deformable_volumes(device: &Device) {
     let taped = Device::flex().autodiff();
     let values = normal([b, sites, m, c], device);
     let reference = uniform([b, v, r, 3], device);
-    let offsets = normal([b, v, r, m, l, p, 3], device);
-    let weights = uniform([b, v, r, m, l, p], device);
+    let offsets = normal([b, v * r, m, l, p, 3], device);
+    let weights = uniform([b, v * r, m, l, p], device);
     let valid = mask([b, v, r], 0.7, device);
     let upstream = normal([b, v, r, m * c], &taped);
     let taped_reference = Tensor::<4>::from_data(reference.to_data(), &taped);

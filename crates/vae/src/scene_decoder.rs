@@ -60,7 +60,7 @@ impl RayAttention {
         let [b, v, n, c] = query.dims();
         let [_, s, _] = values.dims();
         let (m, p) = (self.heads, self.points);
-        let offsets = self.offset.forward(query.clone()).reshape([b, v, n, m, LEVELS, p, 3]);
+        let offsets = self.offset.forward(query.clone()).reshape([b, v * n, m, LEVELS, p, 3]);
         let weights = softmax(self.weight.forward(query.clone()).reshape([b, v, n, m, LEVELS * p]), 4);
         let gathered = ops::deformable_rays_3d(
             values.reshape([b, s, m, c / m]),
@@ -68,7 +68,7 @@ impl RayAttention {
             rays.reference.clone(),
             rays.valid.clone(),
             offsets,
-            weights.reshape([b, v, n, m, LEVELS, p]),
+            weights.reshape([b, v * n, m, LEVELS, p]),
         );
         let rays_per_view = n / depths;
         let logits = self.depth.forward(query).reshape([b * v, depths, rays_per_view]);

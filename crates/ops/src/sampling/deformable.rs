@@ -46,8 +46,8 @@ pub fn deformable_views_2d(
 /// - shapes: (Z, Y, X) per level
 /// - reference: `[B, V, R, 3]`, (x, y, z) in unit coordinates: 0 and 1 are the outer borders of the volume
 /// - valid: `[B, V, R]`
-/// - offsets: `[B, V, R, M, L, P, 3]`, (x, y, z) in cells of level `L`
-/// - weights: `[B, V, R, M, L, P]`
+/// - offsets: `[B, V·R, M, L, P, 3]`, (x, y, z) in cells of level `L`; six axes are all that the ndarray backend has
+/// - weights: `[B, V·R, M, L, P]`
 /// - output: `[B, V, R, M·C]`
 ///
 /// # Panics
@@ -58,11 +58,11 @@ pub fn deformable_rays_3d(
     shapes: &[[usize; 3]],
     reference: Tensor<4>,
     valid: Tensor<3, Bool>,
-    offsets: Tensor<7>,
-    weights: Tensor<6>,
+    offsets: Tensor<6>,
+    weights: Tensor<5>,
 ) -> Tensor<4> {
     let [b, s, m, c] = values.dims();
-    let [_, v, r, _, l, p, axes] = offsets.dims();
+    let [_, v, r, axes] = reference.dims();
     // Every ray point is a query of its own, seen by the only "view" there is: the volume.
     let output = sample_views(
         &Levels::volumes(shapes, 0.5),
@@ -70,8 +70,8 @@ pub fn deformable_rays_3d(
             values: values.reshape([b, 1, s, m, c]),
             reference: reference.reshape([b, 1, v * r, axes]),
             visible: valid.reshape([b, 1, v * r]),
-            offsets: offsets.reshape([b, v * r, m, l, p, axes]),
-            weights: weights.reshape([b, v * r, m, l, p]),
+            offsets,
+            weights,
         },
     );
     output.reshape([b, v, r, m * c])

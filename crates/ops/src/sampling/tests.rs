@@ -188,8 +188,8 @@ fn unit_coordinates_scale_by_their_own_axis() {
             &[shape],
             constant(&reference, [1, 1, 2, 3]),
             mask(&[true, false], [1, 1, 2]),
-            constant(&[0.0; 6], [1, 1, 2, 1, 1, 1, 3]),
-            constant(&[1.0; 2], [1, 1, 2, 1, 1, 1]),
+            constant(&[0.0; 6], [1, 2, 1, 1, 1, 3]),
+            constant(&[1.0; 2], [1, 2, 1, 1, 1]),
         );
         let output = floats(output);
         assert!((output[0] - (100.0 * z + 10.0 * y + x)).abs() < 1e-4 && output[1] == 0.0, "{output:?}");
