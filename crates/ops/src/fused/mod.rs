@@ -29,6 +29,6 @@ pub fn composed_only<R>(body: impl FnOnce() -> R) -> R {
     body()
 }
 
-fn is_composed_only() -> bool {
+pub(crate) fn is_composed_only() -> bool {
     COMPOSED_ONLY.get()
 }
