@@ -34,6 +34,56 @@ pub enum DataError {
         /// The table.
         path: PathBuf,
     },
+    /// A file whose format or contents are not what its kind demands.
+    #[error("not a readable {format} file ({why}): {}", path.display())]
+    Format {
+        /// What it should be: Arrow, SQLite, Parquet, COLMAP, pickle, TFRecord, npz, zip, tar.
+        format: &'static str,
+        /// Position and complaint.
+        why: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A table without a column, or with one of another type.
+    #[error("column {column}: {why}: {}", path.display())]
+    Column {
+        /// The column.
+        column: String,
+        /// Complaint.
+        why: String,
+        /// The table's file.
+        path: PathBuf,
+    },
+    /// A checksum that does not fit its bytes.
+    #[error("wrong checksum of the {what} at byte {offset}: {}", path.display())]
+    Checksum {
+        /// Length, payload or entry.
+        what: &'static str,
+        /// Where it stands.
+        offset: u64,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file that ends before its contents do.
+    #[error("the file ends early at byte {offset}: {}", path.display())]
+    Truncated {
+        /// Where the missing part would begin.
+        offset: u64,
+        /// The file.
+        path: PathBuf,
+    },
+    /// An array of another shape or element type.
+    #[error("array {name} is {got}, not {want}: {}", path.display())]
+    Array {
+        /// Its name in the file.
+        name: String,
+        /// What the file holds.
+        got: String,
+        /// What it must hold.
+        want: String,
+        /// The file.
+        path: PathBuf,
+    },
     /// A key that names a row that does not exist.
     #[error("row {token} of {table} has a {field} that names no row: {}", path.display())]
     Dangling {

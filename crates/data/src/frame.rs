@@ -1,6 +1,8 @@
 //! The neutral records every reader fills: one instant of one vehicle, without pixels until asked.
 
-use geometry::{Box3d, Camera, CameraRig, Intrinsics, Lens, RigCamera, Rigid};
+use std::ops::Range;
+
+use geometry::{BevGrid, Box3d, Camera, CameraRig, Intrinsics, Lens, RigCamera, Rigid};
 
 use crate::{DataError, ImageSource, ObjectClass};
 
@@ -158,6 +160,42 @@ pub struct MapArea {
     pub holes: Vec<Vec<[f64; 2]>>,
 }
 
+/// The map around a car: metres in the ego frame of a frame's reference instant, z of areas dropped.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct LocalMap {
+    /// Polylines, cut at the border of the asked square.
+    pub lines: Vec<MapLine>,
+    /// Areas that reach into the asked square, whole.
+    pub areas: Vec<MapArea>,
+}
+
+/// Which classes the labels of an [`OccupancyGrid`] count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OccupancyLabels {
+    /// Occ3D-nuScenes: 0 to 16, 17 is free. Also SurroundOcc and OpenOccupancy, whose 0 is ignored, and the procedural world.
+    NuScenes,
+    /// Occ3D-Waymo: 0 to 14, 23 is free.
+    Waymo,
+}
+
+/// Semantic occupancy of one instant.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OccupancyGrid {
+    /// Extent and cells, in the grid's own frame.
+    pub grid: BevGrid,
+    /// The grid's frame in the ego frame of the reference instant; not the identity for labels made in the lidar's frame.
+    pub ego_from_grid: Rigid,
+    /// Meaning of the labels.
+    pub label_set: OccupancyLabels,
+    /// One label per cell in the grid's memory order (z, y, x).
+    pub labels: Vec<u8>,
+    /// True where a lidar saw the cell; `None` where the dataset does not say.
+    pub lidar_mask: Option<Vec<bool>>,
+    /// True where a camera saw the cell; `None` where the dataset does not say.
+    pub camera_mask: Option<Vec<bool>>,
+}
+
 /// Optional parts a dataset can deliver. Asking for an absent one is [`DataError::Unsupported`], not an empty answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Capabilities {
@@ -190,6 +228,35 @@ pub trait SceneDataset: Send + Sync {
     /// # Errors
     /// Whatever is wrong with the frame's rows; never a substituted frame.
     fn frame(&self, index: usize) -> Result<SceneFrame, DataError>;
+
+    /// Frame ranges of the scenes, in order; together all frames. Within a scene time ascends.
+    fn scene_ranges(&self) -> Vec<Range<usize>>;
+
+    /// The map within ±`half_m` metres of the car, along both axes of the ego frame.
+    ///
+    /// # Errors
+    /// [`DataError::Unsupported`] for a dataset without maps; whatever is wrong with the map's files.
+    fn local_map(&self, index: usize, half_m: f64) -> Result<LocalMap, DataError> {
+        let _ = (index, half_m);
+        Err(self.unsupported("map"))
+    }
+
+    /// Occupancy labels of a frame.
+    ///
+    /// # Errors
+    /// [`DataError::Unsupported`] for a dataset without occupancy; [`DataError::Missing`] for a frame without labels.
+    fn occupancy(&self, index: usize) -> Result<OccupancyGrid, DataError> {
+        let _ = index;
+        Err(self.unsupported("occupancy"))
+    }
+
+    /// The name it was opened under.
+    fn name(&self) -> &str;
+
+    /// The error for a part this dataset lacks.
+    fn unsupported(&self, what: &'static str) -> DataError {
+        DataError::Unsupported { dataset: self.name().to_owned(), what }
+    }
 
     /// Which optional parts it has.
     fn capabilities(&self) -> Capabilities;

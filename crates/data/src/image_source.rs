@@ -1,13 +1,13 @@
 //! Pixels on demand, already brought to network size.
 
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use geometry::{ImageEdit, Rigid};
 use image::RgbImage;
 
 use crate::resample::resample;
+use crate::store::StoredFile;
 use crate::{DataError, jpeg};
 
 /// Where the pixels of a view are.
@@ -15,8 +15,8 @@ use crate::{DataError, jpeg};
 pub enum ImageSource {
     /// An encoded picture on disk whose size must equal the table's.
     File {
-        /// Absolute path, checked to lie inside the dataset's folder.
-        path: PathBuf,
+        /// The file, checked to lie inside the dataset's root.
+        file: StoredFile,
         /// Width and height the tables announce.
         size: (u32, u32),
     },
@@ -42,7 +42,7 @@ impl ImageSource {
     /// that is not made of scale, shift and mirror.
     pub fn load(&self, edit: &ImageEdit) -> Result<RgbImage, DataError> {
         match self {
-            Self::File { path, size } => resample(&decode_file(path, *size)?, edit),
+            Self::File { file, size } => resample(&decode_file(file, *size)?, edit),
             Self::Rendered { snapshot, camera, world_from_cam } => render(snapshot, camera, world_from_cam, edit),
         }
     }
@@ -53,7 +53,7 @@ impl ImageSource {
     /// As [`ImageSource::load`].
     pub fn decode(&self) -> Result<RgbImage, DataError> {
         match self {
-            Self::File { path, size } => decode_file(path, *size),
+            Self::File { file, size } => decode_file(file, *size),
             Self::Rendered { snapshot, camera, world_from_cam } => {
                 let edit = ImageEdit::identity(camera.intrinsics.width, camera.intrinsics.height);
                 render(snapshot, camera, world_from_cam, &edit)
@@ -67,7 +67,7 @@ impl ImageSource {
     /// As [`ImageSource::load`], as far as the markers of the file show it.
     pub fn inspect(&self) -> Result<(), DataError> {
         match self {
-            Self::File { path, size } => inspect_file(path, *size),
+            Self::File { file, size } => inspect_file(file, *size),
             Self::Rendered { .. } => Ok(()),
         }
     }
@@ -88,28 +88,9 @@ fn render(
         .ok_or_else(|| DataError::Config("the renderer returned a picture of another size".to_owned()))
 }
 
-fn open(path: &Path) -> Result<std::fs::File, DataError> {
-    std::fs::File::open(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound | std::io::ErrorKind::NotADirectory => {
-            DataError::Missing { what: "picture".to_owned(), path: path.to_owned() }
-        }
-        _ => DataError::Io { action: "open", source, path: path.to_owned() },
-    })
-}
-
-fn read(path: &Path) -> Result<Vec<u8>, DataError> {
-    let mut bytes = Vec::new();
-    open(path)?.read_to_end(&mut bytes).map_err(|source| DataError::Io {
-        action: "read",
-        source,
-        path: path.to_owned(),
-    })?;
-    Ok(bytes)
-}
-
 /// All pixels of a picture whose size is known from its table; checked against the file's header before a pixel buffer is reserved.
-fn decode_file(path: &Path, size: (u32, u32)) -> Result<RgbImage, DataError> {
-    let bytes = read(path)?;
+fn decode_file(file: &StoredFile, size: (u32, u32)) -> Result<RgbImage, DataError> {
+    let (bytes, path) = (file.bytes()?, file.path());
     if jpeg::is_jpeg(&bytes) { jpeg::decode(&bytes, size, path) } else { decode_other(&bytes, size, path) }
 }
 
@@ -128,23 +109,12 @@ fn decode_other(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbImage,
     Ok(decoded.map_err(|error| bad(error.to_string()))?.to_rgb8())
 }
 
-fn inspect_file(path: &Path, size: (u32, u32)) -> Result<(), DataError> {
-    use std::io::{Seek, SeekFrom};
-    let io = |source| DataError::Io { action: "read", source, path: path.to_owned() };
-    let mut file = open(path)?;
-    let mut head = Vec::new();
-    file.by_ref().take(64 * 1024).read_to_end(&mut head).map_err(io)?;
-    let length = file.seek(SeekFrom::End(0)).map_err(io)?;
-    let mut tail = [0u8; 2];
-    if length >= 2 {
-        file.seek(SeekFrom::End(-2)).map_err(io)?;
-        file.read_exact(&mut tail).map_err(io)?;
-    }
-    let quick = jpeg::outline(&head, true);
-    match quick {
+fn inspect_file(file: &StoredFile, size: (u32, u32)) -> Result<(), DataError> {
+    let (head, tail) = file.ends(64 * 1024)?;
+    match jpeg::outline(&head, true) {
         Ok(outline) if outline.size == size && tail == [0xFF, 0xD9] => Ok(()),
         // Long application segments, trailing bytes, other formats and every real fault: decode and say it exactly.
-        _ => decode_file(path, size).map(|_| ()),
+        _ => decode_file(file, size).map(|_| ()),
     }
 }
 
@@ -166,7 +136,7 @@ mod tests {
     fn source(folder: &Path, name: &str, bytes: &[u8], size: (u32, u32)) -> ImageSource {
         let path = folder.join(name);
         std::fs::write(&path, bytes).unwrap();
-        ImageSource::File { path, size }
+        ImageSource::File { file: path.into(), size }
     }
 
     #[test]
@@ -210,8 +180,9 @@ mod tests {
             let grey = image::GrayImage::from_pixel(width, height, image::Luma([77]));
             let path = folder.path().join("grey.jpg");
             grey.save(&path).unwrap();
-            let loaded =
-                ImageSource::File { path, size: (width, height) }.load(&ImageEdit::identity(width, height)).unwrap();
+            let loaded = ImageSource::File { file: path.into(), size: (width, height) }
+                .load(&ImageEdit::identity(width, height))
+                .unwrap();
             assert!(loaded.pixels().all(|pixel| pixel.0.iter().all(|value| value.abs_diff(77) < 3)));
         }
     }
@@ -241,11 +212,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("grey.png");
         image::GrayImage::from_fn(9, 5, |x, y| image::Luma([(x + 10 * y) as u8])).save(&path).unwrap();
-        let picture = ImageSource::File { path, size: (9, 5) }.load(&ImageEdit::identity(9, 5)).unwrap();
+        let picture = ImageSource::File { file: path.into(), size: (9, 5) }.load(&ImageEdit::identity(9, 5)).unwrap();
         assert_eq!(picture.get_pixel(3, 4), &Rgb([43, 43, 43]));
         let text = source(folder.path(), "text.jpg", b"hello there", (9, 5));
         assert!(matches!(text.load(&ImageEdit::identity(9, 5)), Err(DataError::Image { .. })));
-        let absent = ImageSource::File { path: folder.path().join("absent.jpg"), size: (1, 1) };
+        let absent = ImageSource::File { file: folder.path().join("absent.jpg").into(), size: (1, 1) };
         assert!(matches!(absent.load(&ImageEdit::identity(1, 1)), Err(DataError::Missing { .. })));
     }
 }

@@ -18,13 +18,17 @@ mod registry;
 mod resample;
 mod sample;
 mod seeding;
+pub mod store;
 pub mod taxonomy;
 mod undistort;
 
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
 pub use error::DataError;
-pub use frame::{Capabilities, Clip, FrameId, MapArea, MapKind, MapLine, ObjectBox, SceneDataset, SceneFrame, View};
+pub use frame::{
+    Capabilities, Clip, FrameId, LocalMap, MapArea, MapKind, MapLine, ObjectBox, OccupancyGrid, OccupancyLabels,
+    SceneDataset, SceneFrame, View,
+};
 pub use image_source::ImageSource;
 pub use loader::{Loader, LoaderConfig};
 pub use mixture::{Mixture, MixtureConfig, MixtureOrder, MixtureWeights};

@@ -2,6 +2,7 @@
 //!
 //! Nothing is stored: a frame is a pure function of the seed. Training and held-out sets differ by their seed only.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -184,6 +185,15 @@ impl SceneDataset for Procedural {
             boxes: Some(world.actors_at(time_secs).iter().map(|actor| object_box(actor, &ego_from_world)).collect()),
             scene_text: Some(world.caption()),
         })
+    }
+
+    fn scene_ranges(&self) -> Vec<Range<usize>> {
+        let per_scene = self.config.frames_per_scene;
+        (0..self.config.scenes).map(|scene| scene * per_scene..(scene + 1) * per_scene).collect()
+    }
+
+    fn name(&self) -> &str {
+        &self.config.name
     }
 
     fn capabilities(&self) -> Capabilities {

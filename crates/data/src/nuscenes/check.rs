@@ -63,7 +63,7 @@ pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, Data
         for index in scene.frames {
             for view in dataset.frame(index)?.views {
                 match view.image {
-                    Some(ImageSource::File { path, size }) => _ = pictures.insert((path, size)),
+                    Some(ImageSource::File { file, size }) => _ = pictures.insert((file, size)),
                     Some(ImageSource::Rendered { .. }) => {}
                     None => report.absent_views += 1,
                 }
@@ -72,8 +72,8 @@ pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, Data
         let pictures: Vec<_> = pictures.into_iter().collect();
         let chosen = decode.min(pictures.len());
         let decoded: BTreeSet<usize> = (0..chosen).map(|i| (2 * i + 1) * pictures.len() / (2 * chosen)).collect();
-        let faults = pictures.into_par_iter().enumerate().map(|(at, (path, size))| {
-            let source = ImageSource::File { path, size };
+        let faults = pictures.into_par_iter().enumerate().map(|(at, (file, size))| {
+            let source = ImageSource::File { file, size };
             let outcome = if decoded.contains(&at) { source.decode().map(drop) } else { source.inspect() };
             (decoded.contains(&at), outcome.err())
         });

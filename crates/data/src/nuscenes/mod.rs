@@ -187,7 +187,7 @@ impl NuScenes {
             }
         };
         let image = picture.map(|picture| ImageSource::File {
-            path: self.root.join(self.pictures.file_name(picture, &self.base)),
+            file: self.root.join(self.pictures.file_name(picture, &self.base)).into(),
             size: picture.size,
         });
         Ok(View {
@@ -228,6 +228,14 @@ impl SceneDataset for NuScenes {
             boxes,
             scene_text: (!scene.description.is_empty()).then(|| scene.description.to_string()),
         })
+    }
+
+    fn scene_ranges(&self) -> Vec<Range<usize>> {
+        self.ranges.clone()
+    }
+
+    fn name(&self) -> &str {
+        &self.config.name
     }
 
     fn capabilities(&self) -> Capabilities {

@@ -60,7 +60,7 @@ fn open(config: &NuScenesConfig) -> NuScenes {
 
 fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
     match source? {
-        ImageSource::File { path, .. } => Some(path),
+        ImageSource::File { file, .. } => Some(file.path()),
         ImageSource::Rendered { .. } => None,
     }
 }

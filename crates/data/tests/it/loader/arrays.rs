@@ -261,7 +261,7 @@ fn distorted_pictures_become_pinhole_pictures() {
         let ring = Ring::new(folder.path(), "lens", 1, 1);
         let mut frame = ring.frame(0).unwrap();
         frame.views[0].lens = lens;
-        frame.views[0].image = Some(ImageSource::File { path, size: (RAW.width, RAW.height) });
+        frame.views[0].image = Some(ImageSource::File { file: path.into(), size: (RAW.width, RAW.height) });
         let view = &Sample::load(&frame, &options(PoseMode::Static)).unwrap().target[0];
         let cam_from_img: DMat3 = (view.edit.img_from_raw * view.k).inverse();
         let image = view.image.as_ref().unwrap();

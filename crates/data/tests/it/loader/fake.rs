@@ -89,7 +89,8 @@ impl SceneDataset for Ring {
             View {
                 channel: format!("CAM_{view}"),
                 timestamp_ns: ((seconds + delay) * 1e9) as i64,
-                image: (!self.absent.contains(&view)).then(|| ImageSource::File { path: self.path(index, view), size }),
+                image: (!self.absent.contains(&view))
+                    .then(|| ImageSource::File { file: self.path(index, view).into(), size }),
                 mask: None,
                 intrinsics: RAW,
                 lens: Lens::Pinhole,
@@ -105,6 +106,14 @@ impl SceneDataset for Ring {
             boxes: None,
             scene_text: None,
         })
+    }
+
+    fn scene_ranges(&self) -> Vec<std::ops::Range<usize>> {
+        std::iter::once(0..self.frames).collect()
+    }
+
+    fn name(&self) -> &str {
+        self.name
     }
 
     fn capabilities(&self) -> Capabilities {
