@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The only arrows allowed, as in crates/README.md. `recipes` is the root package.
-const ARROWS: [(&str, &[&str]); 10] = [
+const ARROWS: [(&str, &[&str]); 11] = [
     ("geometry", &[]),
     ("world", &["geometry"]),
     ("data", &["geometry", "world"]),
     ("ops", &[]),
     ("nn", &["ops"]),
+    ("diffusion", &[]),
     ("features", &["nn"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
     ("metrics", &["features"]),

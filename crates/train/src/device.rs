@@ -45,6 +45,15 @@ impl DeviceConfig {
         }
     }
 
+    /// How many micro batches of one step should be computed side by side: the threads of a CPU, one on a GPU, which is busy
+    /// with one.
+    pub fn lanes(self) -> usize {
+        match self {
+            Self::Flex | Self::NdArray => rayon::current_num_threads(),
+            Self::Wgpu | Self::Vulkan | Self::Metal | Self::Cuda | Self::Rocm => 1,
+        }
+    }
+
     /// Opens the device and runs one small operation on it, so that a missing driver shows here and not in the first
     /// training step. The device has no autodiff; training code calls `.autodiff()` on it once.
     ///

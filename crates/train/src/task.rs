@@ -126,7 +126,13 @@ impl StepOutput {
         self.scalars.push((name, value.into()));
     }
 
-    /// Reads all scalars; those on the device in one transfer.
+    /// Adds the scalars of another part of the step behind these.
+    pub fn append(&mut self, part: Self) {
+        self.images += part.images;
+        self.scalars.extend(part.scalars);
+    }
+
+    /// Reads all scalars; those on the device in one transfer. One name's values, of several micro batches, become their mean.
     pub(crate) fn read(self) -> Scalars {
         let on_device = self.scalars.iter().filter_map(|(_, value)| match value {
             ScalarValue::Device(tensor) => Some(Tensor::clone(tensor).inner()),
@@ -143,6 +149,14 @@ impl StepOutput {
             ScalarValue::Host(value) => *value,
             ScalarValue::Device(_) => fetched.next().map_or(f64::NAN, f64::from),
         };
-        self.scalars.iter().map(|(name, value)| ((*name).to_string(), read(value))).collect()
+        let mut sums: Vec<(&'static str, f64, f64)> = Vec::new();
+        for (name, value) in &self.scalars {
+            let value = read(value);
+            match sums.iter_mut().find(|(known, ..)| known == name) {
+                Some((_, sum, count)) => (*sum, *count) = (*sum + value, *count + 1.0),
+                None => sums.push((name, value, 1.0)),
+            }
+        }
+        sums.into_iter().map(|(name, sum, count)| (name.to_string(), sum / count)).collect()
     }
 }

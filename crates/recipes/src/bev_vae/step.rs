@@ -48,7 +48,8 @@ pub struct Step<'a> {
 
 impl Step<'_> {
     /// Forward and backward; the caller applies the gradients.
-    pub fn run(&self, batch: &SceneBatch, micro: u64, ctx: &StepContext, output: &mut StepOutput) -> StepGradients {
+    pub fn run(&self, batch: &SceneBatch, micro: u64, ctx: &StepContext) -> (StepGradients, StepOutput) {
+        let mut output = StepOutput::new(batch.target.mask.iter().filter(|present| **present).count());
         let stream = |purpose: &str| train::stream(ctx.seed, &format!("{purpose}/{micro}"), ctx.step);
         let (posterior, decoded) = self.forward(batch, &mut stream("posterior"));
         let target = normalise(pictures(&batch.target, self.device));
@@ -77,7 +78,7 @@ impl Step<'_> {
         }
         let total = (decoded.images * Tensor::from_inner(upstream)).sum() + kl * self.kl_weight;
         let generator = GradientsParams::from_grads(total.backward(), self.model);
-        StepGradients { generator, discriminator }
+        (StepGradients { generator, discriminator }, output)
     }
 
     fn forward(&self, batch: &SceneBatch, noise: &mut ChaCha8Rng) -> (DiagonalGaussian, Decoded) {

@@ -9,7 +9,7 @@ use data::{Loader, LoaderConfig, Mixture, SceneBatch};
 use nn::Init;
 use train::{
     BatchSource, CheckpointReader, CheckpointWriter, Ema, GradientMean, Optimizer, Scalars, StepContext, StepOutput,
-    Task, TrainError,
+    Task, TrainError, in_lanes,
 };
 use vae::{BevVae, Discriminator};
 
@@ -74,6 +74,11 @@ impl BevVaeTask {
         self.ema.apply(self.model.clone().valid())
     }
 
+    /// The same weights as leaves of a graph of their own.
+    fn fork<M: Module>(&self, network: &M) -> M {
+        network.clone().fork(&self.device)
+    }
+
     /// What is measured.
     pub fn evaluator(&self) -> &Evaluator {
         &self.evaluator
@@ -84,24 +89,33 @@ impl Task for BevVaeTask {
     type Batch = SceneBatch;
 
     fn train_step(&mut self, batches: Vec<SceneBatch>, ctx: &StepContext) -> Result<StepOutput, TrainError> {
-        let images = batches.iter().flat_map(|batch| &batch.target.mask).filter(|present| **present).count();
-        let mut output = StepOutput::new(images);
         let begun = |share: f64| ctx.step as f64 >= share * ctx.total_steps as f64;
         let adversary = self.adversary.as_ref().filter(|state| begun(state.config.discriminator_start));
-        let step = Step {
-            model: &self.model,
-            perceptual: self.perceptual.as_ref(),
-            adversary: adversary.map(|state| Adversary {
-                discriminator: &state.discriminator,
+        // Sequential forks, because parameter ids and tensors are shared with the module they come from.
+        let micro = |(number, batch)| {
+            let networks = (self.fork(&self.model), adversary.map(|state| self.fork(&state.discriminator)));
+            (number, batch, networks)
+        };
+        let micros: Vec<(u64, &SceneBatch, (BevVae, Option<Discriminator>))> = (0..).zip(&batches).map(micro).collect();
+        let parts = in_lanes(&micros, self.experiment.device.lanes(), |_, (number, batch, (model, discriminator))| {
+            let adversary = adversary.zip(discriminator.as_ref()).map(|(state, discriminator)| Adversary {
+                discriminator,
                 weight: if begun(state.config.generator_start) { state.config.weight } else { 0.0 },
                 views: state.config.views,
-            }),
-            kl_weight: self.experiment.loss.kl_weight,
-            device: &self.device,
-        };
+            });
+            let step = Step {
+                model,
+                perceptual: self.perceptual.as_ref(),
+                adversary,
+                kl_weight: self.experiment.loss.kl_weight,
+                device: &self.device,
+            };
+            step.run(batch, *number, ctx)
+        });
+        let mut output = StepOutput::new(0);
         let (mut generator, mut discriminator) = (GradientMean::default(), GradientMean::default());
-        for (micro, batch) in batches.iter().enumerate() {
-            let gradients = step.run(batch, micro as u64, ctx, &mut output);
+        for (gradients, part) in parts {
+            output.append(part);
             generator.add(&self.model, gradients.generator);
             if let (Some(state), Some(gradients)) = (adversary, gradients.discriminator) {
                 discriminator.add(&state.discriminator, gradients);

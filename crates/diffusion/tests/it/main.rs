@@ -1,0 +1,5 @@
+//! Samplers against stored trajectories and against distributions with known scores.
+
+mod gaussian;
+mod golden;
+mod trajectories;
