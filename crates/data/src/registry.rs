@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use crate::nuplan::{NuPlan, NuPlanConfig};
 use crate::nuscenes::{NuScenes, NuScenesConfig};
 use crate::procedural::{Procedural, ProceduralConfig};
 use crate::{DataError, SceneDataset};
@@ -35,4 +36,6 @@ datasets! {
     "procedural" => Procedural(ProceduralConfig),
     /// The nuScenes tables, also those our own writer makes.
     "nuscenes" => NuScenes(NuScenesConfig),
+    /// nuPlan logs with pictures.
+    "nuplan" => NuPlan(NuPlanConfig),
 }

@@ -46,6 +46,17 @@ impl ObjectClass {
     }
 }
 
+/// What to do with a native category.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ClassRule {
+    /// Leave its boxes out.
+    Drop,
+    /// Give its boxes this class.
+    #[serde(untagged)]
+    As(ObjectClass),
+}
+
 /// The shared class of a nuScenes category name; `None` for a name the taxonomy has no rule for.
 pub fn from_nuscenes(category: &str) -> Option<ObjectClass> {
     use ObjectClass::*;
@@ -72,6 +83,21 @@ pub fn from_nuscenes(category: &str) -> Option<ObjectClass> {
         | "movable_object.pushable_pullable"
         | "movable_object.debris"
         | "static_object.bicycle_rack" => Other,
+        _ => return None,
+    })
+}
+
+/// The shared class of a nuPlan category name; `None` for a name the taxonomy has no rule for. All motor vehicles are one category there.
+pub fn from_nuplan(category: &str) -> Option<ObjectClass> {
+    use ObjectClass::*;
+    Some(match category {
+        "vehicle" => Car,
+        "bicycle" => Bicycle,
+        "pedestrian" => Pedestrian,
+        "traffic_cone" => TrafficCone,
+        "barrier" => Barrier,
+        "czone_sign" => Sign,
+        "generic_object" => Other,
         _ => return None,
     })
 }

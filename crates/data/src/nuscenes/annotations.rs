@@ -7,12 +7,13 @@ use std::path::Path;
 use geometry::glam::{DQuat, DVec3};
 use geometry::{GeometryError, Rigid};
 
-use super::config::{ClassRule, NuScenesConfig};
+use super::config::NuScenesConfig;
 use super::json::{owned, read_all, read_table};
 use super::rows::{AnnotationRow, AnnotationTable, AttributeTable, CategoryTable, InstanceTable, VisibilityTable};
 use super::tables::Base;
 use super::token::{Index, Key, Names, index_of, odd_text};
-use crate::{DataError, ObjectClass, taxonomy};
+use crate::taxonomy::{self, ClassRule};
+use crate::{DataError, ObjectClass};
 
 /// One box.
 #[derive(Debug, Clone, Copy)]

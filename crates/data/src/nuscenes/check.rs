@@ -48,8 +48,15 @@ impl CheckReport {
 /// # Errors
 /// Broken tables and poses; broken pictures are listed in the report.
 pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, DataError> {
-    let dataset = NuScenes::open(config)?;
-    let scenes = dataset.scenes();
+    check_dataset(&NuScenes::open(config)?, decode)
+}
+
+/// The same for any opened dataset.
+///
+/// # Errors
+/// Frames that cannot be read; broken pictures are listed in the report.
+pub fn check_dataset(dataset: &dyn SceneDataset, decode: usize) -> Result<CheckReport, DataError> {
+    let scenes = dataset.scene_ranges();
     let mut report = CheckReport {
         scenes: scenes.len(),
         frames: dataset.len(),
@@ -60,7 +67,7 @@ pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, Data
     };
     for scene in scenes {
         let mut pictures = BTreeSet::new();
-        for index in scene.frames {
+        for index in scene {
             for view in dataset.frame(index)?.views {
                 match view.image {
                     Some(ImageSource::File { file, size }) => _ = pictures.insert((file, size)),

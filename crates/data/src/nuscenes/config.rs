@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{DataError, ObjectClass};
+use crate::DataError;
+use crate::taxonomy::ClassRule;
 
 /// Settings of the nuScenes reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -132,17 +133,6 @@ pub enum PictureTime {
     AsWritten,
 }
 
-/// What to do with a native category.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ClassRule {
-    /// Leave its boxes out.
-    Drop,
-    /// Give its boxes this class.
-    #[serde(untagged)]
-    As(ObjectClass),
-}
-
 fn default_version() -> String {
     "v1.0-trainval".to_owned()
 }
@@ -181,6 +171,7 @@ pub(super) fn split_scenes(split: &str) -> Option<Vec<String>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ObjectClass;
 
     #[test]
     fn splits_have_their_official_sizes_and_do_not_overlap() {

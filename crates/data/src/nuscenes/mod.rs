@@ -20,9 +20,10 @@ use std::path::PathBuf;
 
 use geometry::{GeometryError, Lens, PoseTrack, Rigid};
 
+pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
-pub use check::{CheckReport, check};
-pub use config::{BoxMode, ClassRule, FrameChoice, NuScenesConfig, PictureTime};
+pub use check::{CheckReport, check, check_dataset};
+pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
 
 use annotations::Annotations;
 use pictures::Pictures;

@@ -159,7 +159,7 @@ impl NuScenesWriterConfig {
 }
 
 /// Names become parts of paths and keys: plain and different from each other.
-fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
+pub(crate) fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
     let mut sorted: Vec<&String> = names.iter().collect();
     sorted.sort();
     if let Some(twice) = sorted.windows(2).find(|pair| pair[0] == pair[1]) {
@@ -179,14 +179,14 @@ fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
 }
 
 /// In our pixel convention a resize scales all four numbers.
-fn scaled(raw: &Intrinsics, (width, height): (u32, u32)) -> Intrinsics {
+pub(crate) fn scaled(raw: &Intrinsics, (width, height): (u32, u32)) -> Intrinsics {
     let (sx, sy) = (f64::from(width) / f64::from(raw.width), f64::from(height) / f64::from(raw.height));
     Intrinsics { fx: raw.fx * sx, fy: raw.fy * sy, cx: raw.cx * sx, cy: raw.cy * sy, width, height }
 }
 
 /// `manifest.json` beside the data: enough to make the same bytes again and to compare with the world they show.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Manifest {
+pub struct Manifest<C = NuScenesWriterConfig, S = ManifestScene> {
     /// Name and version of the tool.
     pub tool: String,
     /// Layout of the folder.
@@ -200,9 +200,9 @@ pub struct Manifest {
     /// SHA-256 of `config` as compact JSON.
     pub config_sha256: String,
     /// All settings that shape the bytes.
-    pub config: NuScenesWriterConfig,
+    pub config: C,
     /// The scenes in order.
-    pub scenes: Vec<ManifestScene>,
+    pub scenes: Vec<S>,
     /// SHA-256 of every table and map, by path inside the folder.
     pub sha256: BTreeMap<String, String>,
 }

@@ -7,26 +7,26 @@ use tempfile::TempDir;
 use crate::DataError;
 
 /// Present in every folder this crate wrote; only such a folder, or an empty one, may be replaced.
-pub(super) const MANIFEST: &str = "manifest.json";
+pub(crate) const MANIFEST: &str = "manifest.json";
 
 /// An error of the operating system with its file.
-pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> DataError {
+pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> DataError {
     move |source| DataError::Io { action, source, path: path.to_owned() }
 }
 
 /// Writes a whole file.
-pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     std::fs::write(path, bytes).map_err(io("write", path))
 }
 
 /// Makes a folder and those above it.
-pub(super) fn create_dir(path: &Path) -> Result<(), DataError> {
+pub(crate) fn create_dir(path: &Path) -> Result<(), DataError> {
     std::fs::create_dir_all(path).map_err(io("make the folder", path))
 }
 
 /// A folder under construction next to its final place; removed when dropped before [`Staging::publish`].
 #[derive(Debug)]
-pub(super) struct Staging {
+pub(crate) struct Staging {
     shell: TempDir,
     target: PathBuf,
 }
@@ -34,7 +34,7 @@ pub(super) struct Staging {
 impl Staging {
     /// # Errors
     /// The target exists and may not be replaced: `force` is missing, or it is not empty and no [`MANIFEST`] lies in it.
-    pub(super) fn new(target: &Path, force: bool) -> Result<Self, DataError> {
+    pub(crate) fn new(target: &Path, force: bool) -> Result<Self, DataError> {
         check_target(target, force)?;
         let parent = match target.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent,
@@ -52,12 +52,12 @@ impl Staging {
     }
 
     /// Where to write.
-    pub(super) fn folder(&self) -> PathBuf {
+    pub(crate) fn folder(&self) -> PathBuf {
         self.shell.path().join("data")
     }
 
     /// Moves the finished folder to its place; what was there is removed.
-    pub(super) fn publish(self) -> Result<(), DataError> {
+    pub(crate) fn publish(self) -> Result<(), DataError> {
         let old = self.shell.path().join("old");
         if self.target.exists() {
             std::fs::rename(&self.target, &old).map_err(io("move away", &self.target))?;

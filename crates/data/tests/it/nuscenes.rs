@@ -13,7 +13,7 @@ use data::{ImageSource, SceneDataset, SceneFrame};
 use serde_json::Value;
 
 /// A folder named by an environment variable. Without the variable `None`, with a note; with it, a missing folder fails the test.
-fn folder(variable: &str, inside: &str) -> Option<PathBuf> {
+pub(crate) fn folder(variable: &str, inside: &str) -> Option<PathBuf> {
     match std::env::var_os(variable) {
         Some(root) => {
             let path = Path::new(&root).join(inside);
@@ -40,12 +40,12 @@ fn golden_folder(inside: &str) -> Option<PathBuf> {
     Some(path)
 }
 
-fn json(path: &Path) -> Value {
+pub(crate) fn json(path: &Path) -> Value {
     let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-fn floats<const N: usize>(value: &Value) -> [f64; N] {
+pub(crate) fn floats<const N: usize>(value: &Value) -> [f64; N] {
     let list: Vec<f64> = value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect();
     list.try_into().unwrap()
 }
@@ -58,7 +58,7 @@ fn open(config: &NuScenesConfig) -> NuScenes {
     NuScenes::open(config).unwrap()
 }
 
-fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
+pub(crate) fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
     match source? {
         ImageSource::File { file, .. } => Some(file.path()),
         ImageSource::Rendered { .. } => None,
