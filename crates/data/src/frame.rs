@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use geometry::{BevGrid, Box3d, Camera, CameraRig, Intrinsics, Lens, RigCamera, Rigid};
 
-use crate::{DataError, ImageSource, ObjectClass};
+use crate::{DataError, ImageSource, ObjectClass, caption};
 
 /// Where a frame comes from; kept through batches so that every error and every exported file can name it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -82,6 +82,15 @@ impl View {
 }
 
 impl SceneFrame {
+    /// The dataset's own words, or a sentence that counts what is annotated where it has none. Time of day and weather are unknown
+    /// then and not mentioned.
+    pub fn caption(&self) -> String {
+        match &self.scene_text {
+            Some(text) => text.clone(),
+            None => caption::of_boxes(self.boxes.as_deref().unwrap_or_default()),
+        }
+    }
+
     /// The static part of the views, in order.
     pub fn rig(&self) -> CameraRig {
         CameraRig { cameras: self.views.iter().map(View::rig_camera).collect() }
@@ -149,7 +158,8 @@ pub struct MapLine {
     pub points: Vec<[f64; 3]>,
 }
 
-/// An area of the map; the call that returns it states the frame.
+/// An area of the map; the call that returns it states the frame. An area of kind [`MapKind::Boundary`] is what that border encloses,
+/// the drivable area.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapArea {
     /// Meaning.
@@ -169,11 +179,11 @@ pub struct LocalMap {
     pub areas: Vec<MapArea>,
 }
 
-/// Which classes the labels of an [`OccupancyGrid`] count.
+/// Which classes the labels of an [`OccupancyGrid`] count. Label 255 ([`OccupancyGrid::IGNORED`]) is outside every set: nothing is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OccupancyLabels {
-    /// Occ3D-nuScenes: 0 to 16, 17 is free. Also SurroundOcc and OpenOccupancy, whose 0 is ignored, and the procedural world.
+    /// Occ3D-nuScenes: 0 to 16, 17 is free. Also SurroundOcc, OpenOccupancy and the procedural world.
     NuScenes,
     /// Occ3D-Waymo: 0 to 14, 23 is free.
     Waymo,
@@ -184,7 +194,8 @@ pub enum OccupancyLabels {
 pub struct OccupancyGrid {
     /// Extent and cells, in the grid's own frame.
     pub grid: BevGrid,
-    /// The grid's frame in the ego frame of the reference instant; not the identity for labels made in the lidar's frame.
+    /// The grid's frame in the ego frame of the reference instant; not the identity for labels made in the lidar's frame or at
+    /// another instant.
     pub ego_from_grid: Rigid,
     /// Meaning of the labels.
     pub label_set: OccupancyLabels,
@@ -192,7 +203,8 @@ pub struct OccupancyGrid {
     pub labels: Vec<u8>,
     /// True where a lidar saw the cell; `None` where the dataset does not say.
     pub lidar_mask: Option<Vec<bool>>,
-    /// True where a camera saw the cell; `None` where the dataset does not say.
+    /// True where a camera saw the cell; `None` where the dataset does not say. Labels exist outside it, but losses and scores count
+    /// only what was seen.
     pub camera_mask: Option<Vec<bool>>,
 }
 

@@ -2,16 +2,20 @@
 
 mod augment;
 mod batch;
+mod caption;
 mod error;
 mod frame;
 mod image_source;
 mod jpeg;
 mod loader;
+mod local_map;
 mod mixture;
+pub mod npz;
 pub mod nuplan;
 mod nuplan_writer;
 pub mod nuscenes;
 mod nuscenes_writer;
+pub mod occupancy;
 mod pass;
 mod permutation;
 pub mod pickle;

@@ -7,19 +7,27 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use geometry::glam::DVec3;
-use geometry::{CameraRig, RigPreset, Rigid};
+use geometry::{BevGrid, CameraRig, RigPreset, Rigid};
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
-use world::{ActorState, World, WorldConfig};
+use world::{ActorState, MapAreaKind, MapLineKind, World, WorldConfig};
 
+use crate::local_map::LocalMapBuilder;
+use crate::occupancy::OCC3D_GRID;
 use crate::procedural_cache::SceneCache;
 use crate::seeding::{Purpose, rng};
-use crate::{Capabilities, DataError, FrameId, ImageSource, ObjectBox, ObjectClass, SceneDataset, SceneFrame, View};
+use crate::{
+    Capabilities, DataError, FrameId, ImageSource, LocalMap, MapKind, ObjectBox, ObjectClass, OccupancyGrid,
+    OccupancyLabels, SceneDataset, SceneFrame, View,
+};
 
 /// Time stamp of the first scene's beginning; an arbitrary instant of 2020.
 const EPOCH_NS: i64 = 1_600_000_000_000_000_000;
 /// Time between the beginnings of two scenes; longer than any scene lasts.
 const SCENE_SPACING_NS: i64 = 1_000_000_000_000;
+
+/// Most cells of an occupancy grid: that of the finest published labels has 164 million.
+const MOST_CELLS: usize = 1 << 28;
 
 /// Where the cameras come from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -52,6 +60,8 @@ pub struct ProceduralConfig {
     /// Worlds kept in memory, about half a megabyte each. A shuffled set of more scenes generates most worlds anew for every frame, which
     /// costs as much as rendering about three 64×64 views.
     pub cached_scenes: usize,
+    /// Cells of the occupancy labels, in the ego frame; those of Occ3D by default.
+    pub occupancy: BevGrid,
     /// What the worlds hold.
     pub world: WorldConfig,
 }
@@ -67,6 +77,7 @@ impl Default for ProceduralConfig {
             cameras: Vec::new(),
             yaw_jitter_deg: 0.0,
             cached_scenes: 256,
+            occupancy: OCC3D_GRID,
             world: WorldConfig::default(),
         }
     }
@@ -99,6 +110,13 @@ impl Procedural {
         }
         if !(0.0..=180.0).contains(&config.yaw_jitter_deg) {
             return refuse(format!("yaw_jitter_deg must lie in 0..=180, but is {}", config.yaw_jitter_deg));
+        }
+        if let Err(error) = config.occupancy.checked() {
+            return refuse(format!("occupancy: {error}"));
+        }
+        let cells = config.occupancy.cells.iter().try_fold(1usize, |count, cells| count.checked_mul(*cells));
+        if cells.is_none_or(|cells| cells > MOST_CELLS) {
+            return refuse(format!("occupancy has more than {MOST_CELLS} cells"));
         }
         let mut rig = match &config.rig {
             RigSource::Preset(preset) => preset.rig(),
@@ -134,6 +152,16 @@ impl Procedural {
         })
     }
 
+    /// Scene, time and world of a frame.
+    fn moment(&self, index: usize) -> Result<(usize, f64, Arc<World>), DataError> {
+        if index >= self.len() {
+            let (name, len) = (&self.config.name, self.len());
+            return Err(DataError::Config(format!("dataset {name} has {len} frames; there is no frame {index}")));
+        }
+        let (scene, time_secs) = self.instant(index);
+        Ok((scene, time_secs, self.world(scene)))
+    }
+
     fn frame_rig(&self, index: usize) -> CameraRig {
         let most = self.config.yaw_jitter_deg.to_radians();
         let yaw = rng(self.config.seed, Purpose::Frame, index as u64, 0).random_range(-1.0..=1.0) * most;
@@ -147,12 +175,7 @@ impl SceneDataset for Procedural {
     }
 
     fn frame(&self, index: usize) -> Result<SceneFrame, DataError> {
-        if index >= self.len() {
-            let (name, len) = (&self.config.name, self.len());
-            return Err(DataError::Config(format!("dataset {name} has {len} frames; there is no frame {index}")));
-        }
-        let (scene, time_secs) = self.instant(index);
-        let world = self.world(scene);
+        let (scene, time_secs, world) = self.moment(index)?;
         let world_from_ego = world.world_from_ego(time_secs);
         let timestamp_ns = EPOCH_NS + scene as i64 * SCENE_SPACING_NS + (time_secs * 1e9).round() as i64;
         let snapshot = Arc::new(world.snapshot(time_secs));
@@ -192,12 +215,48 @@ impl SceneDataset for Procedural {
         (0..self.config.scenes).map(|scene| scene * per_scene..(scene + 1) * per_scene).collect()
     }
 
+    fn local_map(&self, index: usize, half_m: f64) -> Result<LocalMap, DataError> {
+        let (_, time_secs, world) = self.moment(index)?;
+        let mut local = LocalMapBuilder::new(&world.world_from_ego(time_secs), half_m)?;
+        for line in &world.map().lines {
+            let kind = match line.kind {
+                MapLineKind::RoadDivider | MapLineKind::LaneDivider => MapKind::Divider,
+                MapLineKind::Boundary => MapKind::Boundary,
+                MapLineKind::Centerline => MapKind::Centerline,
+                MapLineKind::StopLine => MapKind::StopLine,
+                MapLineKind::Crossing => MapKind::Crossing,
+            };
+            local.add_line(kind, line.points.iter().map(|point| point.extend(0.0)));
+        }
+        for area in &world.map().areas {
+            let kind = match area.kind {
+                MapAreaKind::DrivableArea => MapKind::Boundary,
+                MapAreaKind::Crossing => MapKind::Crossing,
+                MapAreaKind::Walkway => MapKind::Walkway,
+                MapAreaKind::StopLine => MapKind::StopLine,
+                MapAreaKind::Carpark => MapKind::Carpark,
+                // Parts of the drivable area.
+                MapAreaKind::RoadSegment | MapAreaKind::Intersection => continue,
+            };
+            local.add_area(kind, &area.outer, &area.holes);
+        }
+        Ok(local.finish())
+    }
+
+    /// Exact: everything is seen, so there are no masks.
+    fn occupancy(&self, index: usize) -> Result<OccupancyGrid, DataError> {
+        let (_, time_secs, world) = self.moment(index)?;
+        let grid = self.config.occupancy;
+        let labels = world.occupancy(time_secs, &world.world_from_ego(time_secs), &grid);
+        OccupancyGrid::new(grid, Rigid::IDENTITY, OccupancyLabels::NuScenes, labels)
+    }
+
     fn name(&self) -> &str {
         &self.config.name
     }
 
     fn capabilities(&self) -> Capabilities {
-        Capabilities { boxes: true, text: true, ..Capabilities::default() }
+        Capabilities { boxes: true, map: true, occupancy: true, text: true, ..Capabilities::default() }
     }
 
     fn max_views(&self) -> usize {

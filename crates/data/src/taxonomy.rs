@@ -46,7 +46,7 @@ impl ObjectClass {
     }
 }
 
-/// What to do with a native category.
+/// What to do with a native class, where a config overrides the tables below.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ClassRule {
@@ -87,7 +87,26 @@ pub fn from_nuscenes(category: &str) -> Option<ObjectClass> {
     })
 }
 
-/// The shared class of a nuPlan category name; `None` for a name the taxonomy has no rule for. All motor vehicles are one category there.
+/// The shared class of an Argoverse 2 category; `None` for a name the taxonomy has no rule for. Riders have boxes of their own there.
+pub fn from_argoverse2(category: &str) -> Option<ObjectClass> {
+    use ObjectClass::*;
+    Some(match category {
+        "REGULAR_VEHICLE" => Car,
+        "TRUCK" | "BOX_TRUCK" | "TRUCK_CAB" | "LARGE_VEHICLE" => Truck,
+        "BUS" | "ARTICULATED_BUS" | "SCHOOL_BUS" => Bus,
+        "VEHICULAR_TRAILER" | "MESSAGE_BOARD_TRAILER" | "TRAFFIC_LIGHT_TRAILER" => Trailer,
+        "MOTORCYCLE" => Motorcycle,
+        "BICYCLE" => Bicycle,
+        "PEDESTRIAN" | "OFFICIAL_SIGNALER" | "BICYCLIST" | "MOTORCYCLIST" | "WHEELED_RIDER" => Pedestrian,
+        "CONSTRUCTION_CONE" | "CONSTRUCTION_BARREL" => TrafficCone,
+        "SIGN" | "STOP_SIGN" | "MOBILE_PEDESTRIAN_CROSSING_SIGN" => Sign,
+        "ANIMAL" | "DOG" => Animal,
+        "BOLLARD" | "RAILED_VEHICLE" | "STROLLER" | "WHEELCHAIR" | "WHEELED_DEVICE" => Other,
+        _ => return None,
+    })
+}
+
+/// The shared class of a nuPlan category; `None` for a name the taxonomy has no rule for. `vehicle` is every motor vehicle.
 pub fn from_nuplan(category: &str) -> Option<ObjectClass> {
     use ObjectClass::*;
     Some(match category {
@@ -100,4 +119,129 @@ pub fn from_nuplan(category: &str) -> Option<ObjectClass> {
         "generic_object" => Other,
         _ => return None,
     })
+}
+
+/// The shared class of a Waymo label type by its name; `None` for a name the taxonomy has no rule for. `VEHICLE` is every motor vehicle,
+/// `CYCLIST` includes the bicycle.
+pub fn from_waymo(label: &str) -> Option<ObjectClass> {
+    use ObjectClass::*;
+    Some(match label {
+        "VEHICLE" => Car,
+        "PEDESTRIAN" => Pedestrian,
+        "SIGN" => Sign,
+        "CYCLIST" => Bicycle,
+        "UNKNOWN" => Other,
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// How many of the names go to each class, in class order.
+    fn counts(of: fn(&str) -> Option<ObjectClass>, names: &[&str]) -> [usize; 13] {
+        let mut counts = [0; 13];
+        for name in names {
+            counts[of(name).unwrap_or_else(|| panic!("no rule for {name}")).index()] += 1;
+        }
+        counts
+    }
+
+    #[test]
+    fn the_first_ten_are_the_detection_classes() {
+        let names = ObjectClass::ALL.map(|class| serde_json::to_value(class).unwrap());
+        let official = [
+            "car",
+            "truck",
+            "bus",
+            "trailer",
+            "construction_vehicle",
+            "motorcycle",
+            "bicycle",
+            "pedestrian",
+            "traffic_cone",
+            "barrier",
+        ];
+        assert_eq!(names[..10], official.map(serde_json::Value::from));
+        assert!(ObjectClass::ALL.iter().enumerate().all(|(at, class)| class.index() == at));
+    }
+
+    #[test]
+    fn all_names_of_nuscenes_have_a_class() {
+        let names = [
+            "human.pedestrian.adult",
+            "human.pedestrian.child",
+            "human.pedestrian.wheelchair",
+            "human.pedestrian.stroller",
+            "human.pedestrian.personal_mobility",
+            "human.pedestrian.police_officer",
+            "human.pedestrian.construction_worker",
+            "animal",
+            "vehicle.car",
+            "vehicle.motorcycle",
+            "vehicle.bicycle",
+            "vehicle.bus.bendy",
+            "vehicle.bus.rigid",
+            "vehicle.truck",
+            "vehicle.construction",
+            "vehicle.emergency.ambulance",
+            "vehicle.emergency.police",
+            "vehicle.trailer",
+            "movable_object.barrier",
+            "movable_object.trafficcone",
+            "movable_object.pushable_pullable",
+            "movable_object.debris",
+            "static_object.bicycle_rack",
+        ];
+        assert_eq!(counts(from_nuscenes, &names), [1, 1, 2, 1, 1, 1, 1, 4, 1, 1, 0, 1, 8]);
+        assert_eq!(from_nuscenes("vehicle.Car"), None);
+    }
+
+    #[test]
+    fn all_names_of_argoverse_2_have_a_class() {
+        let names = [
+            "ANIMAL",
+            "ARTICULATED_BUS",
+            "BICYCLE",
+            "BICYCLIST",
+            "BOLLARD",
+            "BOX_TRUCK",
+            "BUS",
+            "CONSTRUCTION_BARREL",
+            "CONSTRUCTION_CONE",
+            "DOG",
+            "LARGE_VEHICLE",
+            "MESSAGE_BOARD_TRAILER",
+            "MOBILE_PEDESTRIAN_CROSSING_SIGN",
+            "MOTORCYCLE",
+            "MOTORCYCLIST",
+            "OFFICIAL_SIGNALER",
+            "PEDESTRIAN",
+            "RAILED_VEHICLE",
+            "REGULAR_VEHICLE",
+            "SCHOOL_BUS",
+            "SIGN",
+            "STOP_SIGN",
+            "STROLLER",
+            "TRAFFIC_LIGHT_TRAILER",
+            "TRUCK",
+            "TRUCK_CAB",
+            "VEHICULAR_TRAILER",
+            "WHEELCHAIR",
+            "WHEELED_DEVICE",
+            "WHEELED_RIDER",
+        ];
+        assert_eq!(counts(from_argoverse2, &names), [1, 4, 3, 3, 0, 1, 1, 5, 2, 0, 3, 2, 5]);
+        assert_eq!(from_argoverse2("HOVERBOARD"), None);
+    }
+
+    #[test]
+    fn all_names_of_nuplan_and_waymo_have_a_class() {
+        let nuplan = ["vehicle", "bicycle", "pedestrian", "traffic_cone", "barrier", "czone_sign", "generic_object"];
+        assert_eq!(counts(from_nuplan, &nuplan), [1, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 1]);
+        let waymo = ["UNKNOWN", "VEHICLE", "PEDESTRIAN", "SIGN", "CYCLIST"];
+        assert_eq!(counts(from_waymo, &waymo), [1, 0, 0, 0, 0, 0, 1, 1, 0, 0, 1, 0, 1]);
+        assert_eq!((from_nuplan("VEHICLE"), from_waymo("vehicle")), (None, None));
+    }
 }

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::DataError;
+use crate::occupancy::OccupancyConfig;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the nuScenes reader.
@@ -44,6 +45,9 @@ pub struct NuScenesConfig {
     /// Frames that are known to be corrupt, by sample token (or time stamp in ns for frames between key frames).
     #[serde(default)]
     pub exclude: Vec<String>,
+    /// Occupancy labels that belong to the samples.
+    #[serde(default)]
+    pub occupancy: Option<OccupancyConfig>,
     /// Name the frames carry.
     #[serde(default = "default_name")]
     pub name: String,
@@ -64,6 +68,7 @@ impl NuScenesConfig {
             max_pose_gap_ms: default_max_pose_gap_ms(),
             classes: BTreeMap::new(),
             exclude: Vec::new(),
+            occupancy: None,
             name: default_name(),
         }
     }
@@ -172,6 +177,7 @@ pub(super) fn split_scenes(split: &str) -> Option<Vec<String>> {
 mod tests {
     use super::*;
     use crate::ObjectClass;
+    use crate::occupancy::{BetweenKeyFrames, OccupancyKind};
 
     #[test]
     fn splits_have_their_official_sizes_and_do_not_overlap() {
@@ -197,6 +203,12 @@ mod tests {
         assert_eq!(config.frames, FrameChoice::all_pictures());
         assert_eq!(config.classes["a"], ClassRule::Drop);
         assert_eq!(config.classes["b"], ClassRule::As(ObjectClass::Car));
+        let config = parse(r#"{"root": "d", "occupancy": {"kind": "occ3d", "root": "o"}}"#).unwrap();
+        assert_eq!(config.occupancy, Some(OccupancyConfig::new(OccupancyKind::Occ3d, "o")));
+        let text = r#"{"root": "d", "occupancy": {"kind": "surround_occ", "root": "o", "between": "moved"}}"#;
+        assert_eq!(parse(text).unwrap().occupancy.unwrap().between, BetweenKeyFrames::Moved);
+        assert!(parse(r#"{"root": "d", "occupancy": {"kind": "occ4d", "root": "o"}}"#).is_err());
+        assert!(parse(r#"{"root": "d", "occupancy": {"kind": "occ3d", "root": "o", "mask": true}}"#).is_err());
         assert!(parse(r#"{"root": "d", "splitt": "val"}"#).is_err());
         assert!(parse(r#"{"root": "d", "frames": {"all_pictures": {"window": 3}}}"#).is_err());
         assert!(parse(r#"{"root": "d", "classes": {"b": "vehicle"}}"#).is_err());

@@ -6,9 +6,13 @@
 mod annotations;
 mod blocks;
 mod boxes;
+mod can_bus;
 mod check;
 mod config;
+mod expansions;
 mod json;
+pub mod map;
+mod occupancy;
 mod pictures;
 mod rows;
 mod sets;
@@ -20,17 +24,23 @@ use std::path::PathBuf;
 
 use geometry::{GeometryError, Lens, PoseTrack, Rigid};
 
-pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
+pub use can_bus::{CanBus, CanMessage, CanSignal, CanState};
 pub use check::{CheckReport, check, check_dataset};
 pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
 
+pub use crate::taxonomy::ClassRule;
+
 use annotations::Annotations;
+use expansions::Expansions;
+use occupancy::Attached;
 use pictures::Pictures;
 use sets::{PictureSet, SceneRig, Slot};
 use tables::Base;
 
-use crate::{Capabilities, DataError, FrameId, ImageSource, ObjectBox, SceneDataset, SceneFrame, View};
+use crate::{
+    Capabilities, DataError, FrameId, ImageSource, LocalMap, ObjectBox, OccupancyGrid, SceneDataset, SceneFrame, View,
+};
 
 /// A lidar key row whose pose is further from its sample's stamp than this does not belong to that instant (interpolated tables).
 const SAME_INSTANT_NS: i64 = 1_000_000;
@@ -43,6 +53,8 @@ pub struct NuScenes {
     base: Base,
     pictures: Pictures,
     annotations: Option<Annotations>,
+    expansions: Expansions,
+    occupancy: Option<Attached>,
     rigs: Vec<SceneRig>,
     sets: Vec<PictureSet>,
     ranges: Vec<Range<usize>>,
@@ -69,13 +81,16 @@ impl NuScenes {
     /// [`DataError::Empty`]; `all` may be empty.
     pub fn open(config: &NuScenesConfig) -> Result<Self, DataError> {
         config.checked()?;
+        let occupancy = config.occupancy.as_ref().map(Attached::open).transpose()?;
         let base = tables::read_base(config)?;
         let (pictures, annotations) =
             rayon::join(|| pictures::read_pictures(config, &base), || annotations::read_annotations(config, &base));
         let (pictures, annotations) = (pictures?, annotations?);
         let (rigs, sets, ranges) = sets::group(config, &base, &pictures)?;
         let root = base.folder.parent().map(ToOwned::to_owned).unwrap_or_default();
-        Ok(Self { config: config.clone(), root, base, pictures, annotations, rigs, sets, ranges })
+        let expansions = Expansions::find(&root)?;
+        let config = config.clone();
+        Ok(Self { config, root, base, pictures, annotations, expansions, occupancy, rigs, sets, ranges })
     }
 
     /// The scenes in frame order.
@@ -166,8 +181,8 @@ impl NuScenes {
 
     /// Reference instant and pose of a set: the lidar's own pose row at a sample, else between the rows around.
     fn reference(&self, set: &PictureSet) -> Result<(i64, Rigid), DataError> {
-        let lidar = set.sample.and_then(|sample| self.pictures.lidar_pose[sample as usize]);
-        let lidar = lidar.map(|row| self.pictures.poses[row as usize]);
+        let lidar = set.sample.and_then(|sample| self.pictures.lidar[sample as usize].as_ref());
+        let lidar = lidar.map(|row| self.pictures.poses[row.pose as usize]);
         match lidar.filter(|pose| (pose.time_ns - set.time_ns).abs() <= SAME_INSTANT_NS) {
             Some(pose) => Ok((set.time_ns, pose.world_from_ego)),
             None => self.pose_near(set.scene, set.time_ns),
@@ -235,12 +250,27 @@ impl SceneDataset for NuScenes {
         self.ranges.clone()
     }
 
+    fn local_map(&self, index: usize, half_m: f64) -> Result<LocalMap, DataError> {
+        self.map_around(index, half_m)
+    }
+
+    fn occupancy(&self, index: usize) -> Result<OccupancyGrid, DataError> {
+        self.occupancy_of(self.set(index)?)
+    }
+
     fn name(&self) -> &str {
         &self.config.name
     }
 
     fn capabilities(&self) -> Capabilities {
-        Capabilities { boxes: self.annotations.is_some(), text: true, ..Capabilities::default() }
+        Capabilities {
+            boxes: self.annotations.is_some(),
+            map: self.expansions.has_maps,
+            occupancy: self.occupancy.is_some(),
+            can_bus: self.expansions.has_can_bus,
+            masks: false,
+            text: true,
+        }
     }
 
     fn max_views(&self) -> usize {

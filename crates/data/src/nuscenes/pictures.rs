@@ -28,6 +28,18 @@ pub(super) struct Picture {
     name: Option<u32>,
 }
 
+/// The lidar key row of a sample. Its points are never read.
+#[derive(Debug)]
+pub(super) struct LidarRow {
+    pub token: Box<str>,
+    /// As written, not checked.
+    pub file_name: Box<str>,
+    /// Row in [`Pictures::poses`].
+    pub pose: u32,
+    /// Row of the calibration table.
+    pub sensor: u32,
+}
+
 /// One pose row of the car.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pose {
@@ -41,8 +53,8 @@ pub(super) struct Pictures {
     /// Ordered by scene, channel, time.
     pub rows: Vec<Picture>,
     pub poses: Vec<Pose>,
-    /// For each sample, the pose row of its lidar key row.
-    pub lidar_pose: Vec<Option<u32>>,
+    /// For each sample, its lidar key row.
+    pub lidar: Vec<Option<LidarRow>>,
     /// File names that cannot be rebuilt.
     names: Vec<Box<str>>,
 }
@@ -93,7 +105,7 @@ pub(super) fn read_pictures(config: &NuScenesConfig, base: &Base) -> Result<Pict
     let mut found = Pictures {
         rows: Vec::new(),
         poses: poses.iter().map(|pose| pose.unwrap_or(NO_POSE)).collect(),
-        lidar_pose: vec![None; base.samples.len()],
+        lidar: (0..base.samples.len()).map(|_| None).collect(),
         names: Vec::new(),
     };
     for row in kept {
@@ -105,7 +117,8 @@ pub(super) fn read_pictures(config: &NuScenesConfig, base: &Base) -> Result<Pict
                 path: path.clone(),
             }
         })?;
-        found.add(row, pose, base, config.timestamps);
+        let token = names.text(row.key);
+        found.add(row, token, pose, base, config.timestamps);
     }
     found.rows.sort_by_key(|row| (base.samples[row.sample as usize].scene, channel(base, row), row.time_ns));
     Ok(found)
@@ -115,10 +128,12 @@ pub(super) fn read_pictures(config: &NuScenesConfig, base: &Base) -> Result<Pict
 const NO_POSE: Pose = Pose { time_ns: 0, world_from_ego: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::NAN } };
 
 impl Pictures {
-    fn add(&mut self, row: Kept, pose: usize, base: &Base, time: PictureTime) {
+    fn add(&mut self, row: Kept, token: String, pose: usize, base: &Base, time: PictureTime) {
         let mut picture = row.picture;
         if row.is_lidar {
-            self.lidar_pose[picture.sample as usize] = Some(pose as u32);
+            let file_name = row.name.unwrap_or_default();
+            let row = LidarRow { token: token.into(), file_name, pose: pose as u32, sensor: picture.sensor };
+            self.lidar[picture.sample as usize] = Some(row);
             return;
         }
         picture.pose = pose as u32;
@@ -141,7 +156,7 @@ impl Pictures {
 pub(super) fn channel(base: &Base, picture: &Picture) -> u32 {
     match base.sensors[picture.sensor as usize] {
         Sensor::Camera { channel, .. } => channel,
-        Sensor::Lidar | Sensor::Unwanted => u32::MAX,
+        Sensor::Lidar { .. } | Sensor::Unwanted => u32::MAX,
     }
 }
 
@@ -182,7 +197,7 @@ fn keep_row(
         is_key: row.is_key_frame,
         name: None,
     };
-    let mut name = None;
+    let mut name = Some(row.filename.as_str().into());
     if is_camera {
         check_relative(row.filename.as_str(), path)?;
         check_size(&picture, token, path)?;

@@ -200,6 +200,15 @@ pub(super) struct AnnotationRow<'a> {
     pub num_radar_pts: i64,
 }
 
+/// The picture of a map and the logs that were recorded on it. Third-party tables without maps leave both out.
+#[derive(Deserialize)]
+pub(super) struct MapRow<'a> {
+    #[serde(borrow, default)]
+    pub filename: Option<Text<'a>>,
+    #[serde(borrow, default)]
+    pub log_tokens: Vec<Text<'a>>,
+}
+
 macro_rules! tables {
     ($($table:ident => $row:ident,)*) => {$(
         pub(super) struct $table;
@@ -223,5 +232,5 @@ tables! {
     VisibilityTable => VisibilityRow,
     InstanceTable => InstanceRow,
     AnnotationTable => AnnotationRow,
-    MapTable => Token,
+    MapTable => MapRow,
 }

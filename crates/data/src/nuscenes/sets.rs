@@ -85,7 +85,7 @@ pub(super) fn intrinsics(base: &Base, sensor: u32, size: (u32, u32)) -> Option<(
         Sensor::Camera { ego_from_cam, focal_center: [fx, fy, cx, cy], .. } => {
             Some((Intrinsics { fx, fy, cx, cy, width: size.0, height: size.1 }, ego_from_cam))
         }
-        Sensor::Lidar | Sensor::Unwanted => None,
+        Sensor::Lidar { .. } | Sensor::Unwanted => None,
     }
 }
 
@@ -110,7 +110,7 @@ fn scene_rig(base: &Base, pictures: &Pictures, scene: usize, rows: Range<usize>)
     }
     let order = CameraRig { cameras }.clockwise_order();
     let slots = order.into_iter().map(|at| slots[at]).collect();
-    let lidar = base.scenes[scene].samples.clone().filter_map(|sample| pictures.lidar_pose[sample]);
+    let lidar = base.scenes[scene].samples.clone().filter_map(|sample| Some(pictures.lidar[sample].as_ref()?.pose));
     let mut pose_rows: Vec<u32> = scene_pictures.iter().map(|row| row.pose).chain(lidar).collect();
     pose_rows.sort_by_key(|row| (pictures.poses[*row as usize].time_ns, *row));
     pose_rows.dedup_by_key(|row| pictures.poses[*row as usize].time_ns);

@@ -20,8 +20,10 @@ pub(super) const SKIPPED: u32 = u32::MAX;
 /// A selected scene.
 #[derive(Debug)]
 pub(super) struct Scene {
+    pub token: Box<str>,
     pub name: Box<str>,
     pub description: Box<str>,
+    pub log_token: Box<str>,
     pub logfile: Box<str>,
     pub location: Box<str>,
     /// Its samples in [`Base::samples`], ascending in time.
@@ -46,15 +48,26 @@ pub(super) enum Sensor {
         /// fx, fy, cx, cy with pixel centres at +0.5.
         focal_center: [f64; 4],
     },
-    /// Only its pose rows matter: its key rows give the car's pose at the samples' stamps.
-    Lidar,
+    /// Its key rows give the car's pose at the samples' stamps, its mounting places labels made in its frame.
+    Lidar {
+        ego_from_lidar: Rigid,
+    },
     Unwanted,
+}
+
+/// A row of the map table.
+#[derive(Debug)]
+pub(super) struct Prior {
+    /// As written, not checked.
+    pub file_name: Box<str>,
+    pub log_tokens: Vec<Box<str>>,
 }
 
 /// The small tables.
 #[derive(Debug)]
 pub(super) struct Base {
     pub folder: PathBuf,
+    pub priors: Vec<Prior>,
     pub scenes: Vec<Scene>,
     pub samples: Vec<Sample>,
     /// Sample token to its row in `samples`, or [`SKIPPED`].
@@ -97,11 +110,13 @@ pub(super) fn read_base(config: &NuScenesConfig) -> Result<Base, DataError> {
         return Err(DataError::Missing { what: "table folder".to_owned(), path: folder });
     }
     let (channels, sensors, sensor_index) = read_sensors(config, &folder)?;
-    // Nothing of it is needed here, but the format demands the table.
-    read_all::<MapTable, (), _>(&table_path(&folder, "map"), |_| Ok(None))?;
+    let priors = read_all::<MapTable, _, _>(&table_path(&folder, "map"), |row| {
+        let logs = row.log_tokens.iter().map(owned).collect();
+        Ok(row.filename.map(|name| Prior { file_name: owned(&name), log_tokens: logs }))
+    })?;
     let (mut scenes, scene_rows, scene_index, ends) = read_scenes(config, &folder)?;
     let (samples, sample_rows, sample_index) = read_samples(&folder, &mut scenes, &scene_rows, &scene_index)?;
-    let base = Base { folder, scenes, samples, sample_rows, sample_index, sensors, sensor_index, channels };
+    let base = Base { folder, scenes, samples, sample_rows, sample_index, sensors, sensor_index, channels, priors };
     check_ends(&base, &ends)?;
     Ok(base)
 }
@@ -134,7 +149,7 @@ fn read_sensors(config: &NuScenesConfig, folder: &Path) -> Result<Sensors, DataE
         let (_, channel, modality) = &rows[at as usize];
         let sensor = match &**modality {
             "camera" if wanted(channel) => camera(at, &row, &path)?,
-            "lidar" => Sensor::Lidar,
+            "lidar" => Sensor::Lidar { ego_from_lidar: mounting(&row, &path)? },
             _ => Sensor::Unwanted,
         };
         Ok(Some((owned(&row.token), sensor)))
@@ -147,7 +162,7 @@ fn read_sensors(config: &NuScenesConfig, folder: &Path) -> Result<Sensors, DataE
 fn camera(channel: u32, row: &CalibratedSensorRow<'_>, path: &Path) -> Result<Sensor, DataError> {
     let token = || row.token.as_str().to_owned();
     let bad = |source| DataError::Calibration { row: token(), source, path: path.to_owned() };
-    let ego_from_cam = Rigid::from_wxyz(row.rotation, row.translation).map_err(bad)?;
+    let ego_from_cam = mounting(row, path)?;
     let &[[fx, skew, cx], [zero, fy, cy], last] = row.camera_intrinsic.as_slice() else {
         let why = format!("camera_intrinsic of row {} is not a 3x3 matrix", token());
         return Err(DataError::Json { why, path: path.to_owned() });
@@ -162,6 +177,14 @@ fn camera(channel: u32, row: &CalibratedSensorRow<'_>, path: &Path) -> Result<Se
         return Err(DataError::Json { why, path: path.to_owned() });
     }
     Ok(Sensor::Camera { channel, ego_from_cam, focal_center: [fx, fy, cx + 0.5, cy + 0.5] })
+}
+
+fn mounting(row: &CalibratedSensorRow<'_>, path: &Path) -> Result<Rigid, DataError> {
+    Rigid::from_wxyz(row.rotation, row.translation).map_err(|source| DataError::Calibration {
+        row: row.token.as_str().to_owned(),
+        source,
+        path: path.to_owned(),
+    })
 }
 
 /// First and last sample token of each selected scene.
@@ -184,8 +207,10 @@ fn read_scenes(config: &NuScenesConfig, folder: &Path) -> Result<Scenes, DataErr
             path: path.clone(),
         })?;
         let scene = Scene {
+            token: owned(&row.token),
             name: owned(&row.name),
             description: owned(&row.description),
+            log_token: owned(&row.log_token),
             logfile: logs[log as usize].1.clone(),
             location: logs[log as usize].2.clone(),
             samples: 0..0,

@@ -1,6 +1,9 @@
 //! Tests of the data crate that need files, threads or worlds; one binary, because linking is slow.
 
 mod loader;
+mod npz;
 mod nuplan;
 mod nuscenes;
+mod occupancy;
+mod procedural;
 mod writer;

@@ -1,9 +1,12 @@
 //! The nuScenes reader: on tables made here, on the fixtures, on broken tables and against the devkit's numbers.
 
 mod broken;
+mod can_bus;
 mod fixture;
 mod golden;
 mod made;
+mod map;
+mod occupancy;
 mod reading;
 
 use std::path::{Path, PathBuf};

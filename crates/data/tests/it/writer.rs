@@ -1,5 +1,7 @@
 //! The nuScenes writer: identical bytes, no debris, and our reader sees the world that was written.
 
+mod maps;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
