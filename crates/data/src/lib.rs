@@ -3,6 +3,7 @@
 mod augment;
 mod batch;
 mod caption;
+pub mod colmap;
 mod error;
 mod frame;
 mod image_source;
@@ -25,9 +26,12 @@ mod registry;
 mod resample;
 mod sample;
 mod seeding;
+mod staging;
 pub mod store;
 pub mod taxonomy;
 mod undistort;
+pub mod wayvescenes;
+mod wayvescenes_writer;
 
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
@@ -46,3 +50,6 @@ pub use procedural::{Procedural, ProceduralConfig, RigSource};
 pub use registry::{DatasetConfig, open};
 pub use sample::{ImageSize, PoseMode, Sample, SampleOptions, SampleView, rerig};
 pub use taxonomy::ObjectClass;
+pub use wayvescenes_writer::{
+    WayveScenesManifest, WayveScenesManifestScene, WayveScenesWriterConfig, write_wayvescenes,
+};

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::nuplan::{NuPlan, NuPlanConfig};
 use crate::nuscenes::{NuScenes, NuScenesConfig};
 use crate::procedural::{Procedural, ProceduralConfig};
+use crate::wayvescenes::{WayveScenes, WayveScenesConfig};
 use crate::{DataError, SceneDataset};
 
 /// Makes the serde enum and the arm that opens each kind: a new dataset is one line.
@@ -38,4 +39,6 @@ datasets! {
     "nuscenes" => NuScenes(NuScenesConfig),
     /// nuPlan logs with pictures.
     "nuplan" => NuPlan(NuPlanConfig),
+    /// WayveScenes101, also what our own writer makes.
+    "wayve_scenes101" => WayveScenes(WayveScenesConfig),
 }

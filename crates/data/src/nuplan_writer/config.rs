@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::nuscenes_writer::{Manifest, check_names};
+use crate::nuscenes_writer::Manifest;
+use crate::staging::check_names;
 use crate::{DataError, FrameId};
 
 /// Frames of any dataset in the nuPlan layout.

@@ -20,8 +20,8 @@ use sha2::{Digest, Sha256};
 
 pub use config::{NuPlanManifest, NuPlanManifestFrame, NuPlanManifestLog, NuPlanWriterConfig};
 
-use crate::nuscenes_writer::files::{self, Staging};
-use crate::nuscenes_writer::{Manifest, hex};
+use crate::nuscenes_writer::Manifest;
+use crate::staging::{self as files, Staging, hex};
 use crate::{DataError, SceneFrame};
 use plan::Plan;
 

@@ -9,6 +9,7 @@ use world::{RenderOptions, WorldConfig};
 
 use super::timing;
 use crate::DataError;
+use crate::staging::check_names;
 
 /// Names of the official mini split. Scenes borrow them so that `mini_train` and `mini_val` of any tool select scenes.
 const MINI_TRAIN: [&str; 8] =
@@ -155,26 +156,6 @@ impl NuScenesWriterConfig {
             camera.camera().map_err(calibration)?;
         }
         Ok(())
-    }
-}
-
-/// Names become parts of paths and keys: plain and different from each other.
-pub(crate) fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
-    let mut sorted: Vec<&String> = names.iter().collect();
-    sorted.sort();
-    if let Some(twice) = sorted.windows(2).find(|pair| pair[0] == pair[1]) {
-        return Err(DataError::Config(format!("{what} {:?} occurs twice", twice[0])));
-    }
-    let plain = |name: &str| {
-        !name.is_empty()
-            && !name.starts_with('.')
-            && name.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.'))
-    };
-    match names.iter().find(|name| !plain(name)) {
-        Some(name) => {
-            Err(DataError::Config(format!("{what} {name:?} may hold letters, digits, '-', '_' and '.' only")))
-        }
-        None => Ok(()),
     }
 }
 

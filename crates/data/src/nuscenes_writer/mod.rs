@@ -9,7 +9,6 @@ mod annotations;
 mod arcline;
 mod atlas;
 mod config;
-pub(crate) mod files;
 mod lidar;
 mod map_expansion;
 mod map_rows;
@@ -27,16 +26,15 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 use world::{World, WorldConfig};
 
+pub(crate) use config::scaled;
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
-pub(crate) use config::{check_names, scaled};
 
 use crate::DataError;
+use crate::staging::{self as files, Staging};
 use atlas::Atlas;
-use files::Staging;
 use scene::{Scene, Studio};
 use tables::{LogRow, SensorRow, Tables};
-use tokens::TokenSpace;
-pub(crate) use tokens::hex;
+use tokens::{TokenSpace, hex};
 
 /// 2031-01-01 00:00 UTC, after all drives of the release.
 const FIRST_START_US: i64 = 1_924_992_000_000_000;
