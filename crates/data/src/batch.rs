@@ -107,6 +107,21 @@ impl ViewArrays {
         Self::gather(samples.iter().map(Vec::as_slice), size, pad)
     }
 
+    /// Pixels of one view that count, `[H, W]`; `at` is sample · V + view.
+    ///
+    /// # Panics
+    /// When there is no such view.
+    pub fn counted_pixels(&self, at: usize) -> &[bool] {
+        let plane = self.height * self.width;
+        &self.pixel_mask[at * plane..][..plane]
+    }
+
+    /// Whether a view that counts has pixels that do not.
+    pub fn has_ignored_pixels(&self) -> bool {
+        let views = self.mask.iter().enumerate().filter(|(_, present)| **present);
+        views.into_iter().any(|(at, _)| self.counted_pixels(at).contains(&false))
+    }
+
     fn gather<'a>(
         samples: impl ExactSizeIterator<Item = &'a [SampleView]> + Clone,
         size: ImageSize,
