@@ -4,6 +4,7 @@ mod augment;
 mod batch;
 mod caption;
 pub mod colmap;
+mod embedded;
 mod error;
 mod frame;
 mod image_source;
@@ -17,6 +18,7 @@ mod nuplan_writer;
 pub mod nuscenes;
 mod nuscenes_writer;
 pub mod occupancy;
+mod parquet_file;
 mod pass;
 mod permutation;
 pub mod pickle;
@@ -29,12 +31,16 @@ mod seeding;
 mod staging;
 pub mod store;
 pub mod taxonomy;
+mod tfrecord;
 mod undistort;
+pub mod waymo;
+mod waymo_writer;
 pub mod wayvescenes;
 mod wayvescenes_writer;
 
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
+pub use embedded::EmbeddedPicture;
 pub use error::DataError;
 pub use frame::{
     Capabilities, Clip, FrameId, LocalMap, MapArea, MapKind, MapLine, ObjectBox, OccupancyGrid, OccupancyLabels,
@@ -50,6 +56,7 @@ pub use procedural::{Procedural, ProceduralConfig, RigSource};
 pub use registry::{DatasetConfig, open};
 pub use sample::{ImageSize, PoseMode, Sample, SampleOptions, SampleView, rerig};
 pub use taxonomy::ObjectClass;
+pub use waymo_writer::{WaymoManifest, WaymoManifestScene, WaymoWriterConfig, write_waymo};
 pub use wayvescenes_writer::{
     WayveScenesManifest, WayveScenesManifestScene, WayveScenesWriterConfig, write_wayvescenes,
 };

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::nuplan::{NuPlan, NuPlanConfig};
 use crate::nuscenes::{NuScenes, NuScenesConfig};
 use crate::procedural::{Procedural, ProceduralConfig};
+use crate::waymo::{Waymo, WaymoConfig};
 use crate::wayvescenes::{WayveScenes, WayveScenesConfig};
 use crate::{DataError, SceneDataset};
 
@@ -41,4 +42,6 @@ datasets! {
     "nuplan" => NuPlan(NuPlanConfig),
     /// WayveScenes101, also what our own writer makes.
     "wayve_scenes101" => WayveScenes(WayveScenesConfig),
+    /// Waymo Open Dataset, perception: either release.
+    "waymo" => Waymo(WaymoConfig),
 }

@@ -126,6 +126,29 @@ impl StoredFile {
         std::fs::read(&self.path).map_err(|source| self.failure("read", source))
     }
 
+    /// Number of bytes.
+    ///
+    /// # Errors
+    /// [`DataError::Missing`] or [`DataError::Io`].
+    pub fn size(&self) -> Result<u64, DataError> {
+        Ok(std::fs::metadata(&self.path).map_err(|source| self.failure("look at", source))?.len())
+    }
+
+    /// Exactly `length` bytes from `offset`. Memory is reserved for bytes that exist only.
+    ///
+    /// # Errors
+    /// [`DataError::Truncated`] where the file ends before, else as [`StoredFile::bytes`].
+    pub fn read_at(&self, offset: u64, length: u64) -> Result<Vec<u8>, DataError> {
+        let mut file = std::fs::File::open(&self.path).map_err(|source| self.failure("open", source))?;
+        let size = file.metadata().map_err(|source| self.failure("look at", source))?.len();
+        let inside = offset.checked_add(length).is_some_and(|end| end <= size);
+        let truncated = || DataError::Truncated { offset: size, path: self.path.clone() };
+        let mut bytes = vec![0; usize::try_from(length).ok().filter(|_| inside).ok_or_else(truncated)?];
+        file.seek(SeekFrom::Start(offset)).map_err(|source| self.failure("read", source))?;
+        file.read_exact(&mut bytes).map_err(|source| self.failure("read", source))?;
+        Ok(bytes)
+    }
+
     /// The first bytes, at most `head`, and the last two, for a look at a picture without reading it.
     ///
     /// # Errors
@@ -191,6 +214,11 @@ mod tests {
         let names: Vec<_> = store.list("").unwrap().into_iter().map(|n| (n.name, n.is_folder)).collect();
         assert_eq!(names, [("a".into(), false), ("b".into(), false), ("c".into(), true)]);
         assert_eq!(store.read("c/d", "d").unwrap(), b"c/d");
+        let file = store.file("c/d", "d").unwrap();
+        assert_eq!((file.size().unwrap(), file.read_at(1, 2).unwrap()), (3, b"/d".to_vec()));
+        for (offset, length) in [(2, 2), (4, 0), (u64::MAX, 2), (0, u64::MAX)] {
+            assert!(matches!(file.read_at(offset, length), Err(DataError::Truncated { offset: 3, .. })));
+        }
         assert!(store.list("x").unwrap().is_empty());
         let error = store.file("c/e", "calibration").unwrap_err().to_string();
         assert!(error.starts_with("missing calibration") && error.ends_with("c/e"), "{error}");

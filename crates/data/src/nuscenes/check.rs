@@ -71,7 +71,7 @@ pub fn check_dataset(dataset: &dyn SceneDataset, decode: usize) -> Result<CheckR
             for view in dataset.frame(index)?.views {
                 match view.image {
                     Some(ImageSource::File { file, size }) => _ = pictures.insert((file, size)),
-                    Some(ImageSource::Rendered { .. }) => {}
+                    Some(ImageSource::Rendered { .. } | ImageSource::Embedded { .. }) => {}
                     None => report.absent_views += 1,
                 }
             }

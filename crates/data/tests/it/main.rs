@@ -7,5 +7,6 @@ mod nuplan;
 mod nuscenes;
 mod occupancy;
 mod procedural;
+mod waymo;
 mod wayvescenes;
 mod writer;
