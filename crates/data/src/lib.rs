@@ -3,6 +3,7 @@
 mod augment;
 mod batch;
 mod caption;
+mod clip;
 pub mod colmap;
 mod embedded;
 mod error;
@@ -40,15 +41,16 @@ mod wayvescenes_writer;
 
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
+pub use clip::{Clip, ClipConfig, ClipMode, Clips};
 pub use embedded::EmbeddedPicture;
 pub use error::DataError;
 pub use frame::{
-    Capabilities, Clip, FrameId, LocalMap, MapArea, MapKind, MapLine, ObjectBox, OccupancyGrid, OccupancyLabels,
-    SceneDataset, SceneFrame, View,
+    Capabilities, FrameId, FrameOutline, LocalMap, MapArea, MapKind, MapLine, ObjectBox, OccupancyGrid,
+    OccupancyLabels, SceneDataset, SceneFrame, View,
 };
 pub use image_source::ImageSource;
 pub use loader::{Loader, LoaderConfig};
-pub use mixture::{Mixture, MixtureConfig, MixtureOrder, MixtureWeights};
+pub use mixture::{FrameSampling, Mixture, MixtureConfig, MixtureOrder, MixtureWeights};
 pub use nuplan_writer::{NuPlanManifest, NuPlanManifestFrame, NuPlanManifestLog, NuPlanWriterConfig, write_nuplan};
 pub use nuscenes_writer::{Manifest, ManifestScene, NuScenesWriterConfig, write_nuscenes};
 pub use pass::InOrder;
