@@ -1,8 +1,11 @@
 //! Native dataset readers and writers, mixtures of rigs, conditions, batches and the loader.
 
+pub mod argoverse2;
+mod argoverse2_writer;
 mod augment;
 mod batch;
 mod caption;
+mod check;
 mod clip;
 pub mod colmap;
 mod embedded;
@@ -10,8 +13,10 @@ mod error;
 mod frame;
 mod image_source;
 mod jpeg;
+mod lidar;
 mod loader;
 mod local_map;
+mod manifest;
 mod mixture;
 pub mod npz;
 pub mod nuplan;
@@ -39,8 +44,12 @@ mod waymo_writer;
 pub mod wayvescenes;
 mod wayvescenes_writer;
 
+pub use argoverse2_writer::{
+    Argoverse2Log, Argoverse2Manifest, Argoverse2WriterConfig, CategoryRule, ManifestLog, write_argoverse2,
+};
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
+pub use check::{CheckReport, check};
 pub use clip::{Clip, ClipConfig, ClipMode, Clips};
 pub use embedded::EmbeddedPicture;
 pub use error::DataError;
@@ -50,6 +59,7 @@ pub use frame::{
 };
 pub use image_source::ImageSource;
 pub use loader::{Loader, LoaderConfig};
+pub use manifest::WriterManifest;
 pub use mixture::{FrameSampling, Mixture, MixtureConfig, MixtureOrder, MixtureWeights};
 pub use nuplan_writer::{NuPlanManifest, NuPlanManifestFrame, NuPlanManifestLog, NuPlanWriterConfig, write_nuplan};
 pub use nuscenes_writer::{Manifest, ManifestScene, NuScenesWriterConfig, write_nuscenes};
@@ -57,7 +67,7 @@ pub use pass::InOrder;
 pub use procedural::{Procedural, ProceduralConfig, RigSource};
 pub use registry::{DatasetConfig, open};
 pub use sample::{ImageSize, PoseMode, Sample, SampleOptions, SampleView, rerig};
-pub use taxonomy::ObjectClass;
+pub use taxonomy::{ClassRule, ObjectClass};
 pub use waymo_writer::{WaymoManifest, WaymoManifestScene, WaymoWriterConfig, write_waymo};
 pub use wayvescenes_writer::{
     WayveScenesManifest, WayveScenesManifestScene, WayveScenesWriterConfig, write_wayvescenes,

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use crate::argoverse2::{Argoverse2, Argoverse2Config};
 use crate::nuplan::{NuPlan, NuPlanConfig};
 use crate::nuscenes::{NuScenes, NuScenesConfig};
 use crate::procedural::{Procedural, ProceduralConfig};
@@ -44,4 +45,6 @@ datasets! {
     "wayve_scenes101" => WayveScenes(WayveScenesConfig),
     /// Waymo Open Dataset, perception: either release.
     "waymo" => Waymo(WaymoConfig),
+    /// The Argoverse 2 sensor dataset, also that of our own writer.
+    "argoverse2" => Argoverse2(Argoverse2Config),
 }

@@ -3,7 +3,7 @@
 use super::NuPlan;
 use super::config::NuPlanConfig;
 use crate::DataError;
-use crate::nuscenes::{CheckReport, check_dataset};
+use crate::check::{CheckReport, check as check_dataset};
 
 /// What a check of the chosen logs found.
 #[derive(Debug)]

@@ -7,7 +7,6 @@ mod annotations;
 mod blocks;
 mod boxes;
 mod can_bus;
-mod check;
 mod config;
 mod expansions;
 mod json;
@@ -23,12 +22,11 @@ use std::ops::Range;
 
 use geometry::{CameraRig, GeometryError, Lens, PoseTrack, RigCamera, Rigid};
 
+pub use crate::check::CheckReport;
+pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
 pub use can_bus::{CanBus, CanMessage, CanSignal, CanState};
-pub use check::{CheckReport, check, check_dataset};
 pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
-
-pub use crate::taxonomy::ClassRule;
 
 use annotations::Annotations;
 use expansions::Expansions;
@@ -223,6 +221,14 @@ impl NuScenes {
         });
         Ok(View { channel, timestamp_ns, image, mask: None, intrinsics, lens, ego_from_cam, world_from_ego })
     }
+}
+
+/// Opens the tables and looks at every picture, see [`crate::check()`].
+///
+/// # Errors
+/// Broken tables and poses; broken pictures are listed in the report.
+pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, DataError> {
+    crate::check(&NuScenes::open(config)?, decode)
 }
 
 impl SceneDataset for NuScenes {

@@ -1,6 +1,5 @@
 //! What to write, and what was written.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use geometry::{CameraRig, Intrinsics, Lens, RigCamera};
@@ -9,6 +8,7 @@ use world::{RenderOptions, WorldConfig};
 
 use super::timing;
 use crate::DataError;
+use crate::manifest::WriterManifest;
 use crate::staging::check_names;
 
 /// Names of the official mini split. Scenes borrow them so that `mini_train` and `mini_val` of any tool select scenes.
@@ -165,28 +165,8 @@ pub(crate) fn scaled(raw: &Intrinsics, (width, height): (u32, u32)) -> Intrinsic
     Intrinsics { fx: raw.fx * sx, fy: raw.fy * sy, cx: raw.cx * sx, cy: raw.cy * sy, width, height }
 }
 
-/// `manifest.json` beside the data: enough to make the same bytes again and to compare with the world they show.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Manifest<C = NuScenesWriterConfig, S = ManifestScene> {
-    /// Name and version of the tool.
-    pub tool: String,
-    /// Layout of the folder.
-    pub format: String,
-    /// Where the content comes from.
-    pub source: String,
-    /// Codec, quality and whether pictures were resampled.
-    pub pictures: String,
-    /// How many pictures there are.
-    pub picture_count: usize,
-    /// SHA-256 of `config` as compact JSON.
-    pub config_sha256: String,
-    /// All settings that shape the bytes.
-    pub config: C,
-    /// The scenes in order.
-    pub scenes: Vec<S>,
-    /// SHA-256 of every table and map, by path inside the folder.
-    pub sha256: BTreeMap<String, String>,
-}
+/// `manifest.json` beside the data.
+pub type Manifest = WriterManifest<NuScenesWriterConfig, ManifestScene>;
 
 /// How a scene of the dataset came about.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

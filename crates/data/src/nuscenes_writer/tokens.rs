@@ -2,7 +2,7 @@
 
 use sha2::{Digest, Sha256};
 
-pub(super) use crate::staging::hex;
+use crate::manifest::hex;
 
 /// Names rows of one dataset; datasets of different seeds share no token.
 #[derive(Debug, Clone)]

@@ -1,6 +1,7 @@
 //! Tests of the data crate that need files, threads or worlds; one binary, because linking is slow.
 
 mod archives;
+mod argoverse2;
 mod clips;
 mod colmap;
 mod listed;

@@ -50,31 +50,27 @@ pub fn check_data(args: &CheckDataArgs) -> anyhow::Result<()> {
 }
 
 fn check(config: &DatasetConfig, images: usize) -> anyhow::Result<usize> {
-    match config {
-        DatasetConfig::NuScenes(config) => {
-            let report = data::nuscenes::check(config, images)?;
-            say(format_args!(
-                "{}: {} scenes, {} frames, {} pictures ({} decoded completely), {} views without a picture, {} missing, {} damaged",
-                config.root.display(),
-                report.scenes,
-                report.frames,
-                report.pictures,
-                report.decoded,
-                report.absent_views,
-                report.missing(),
-                report.damaged()
-            ))?;
-            for problem in &report.problems {
-                say(format_args!("  {problem}"))?;
-            }
-            Ok(report.problems.len())
-        }
-        DatasetConfig::Procedural(settings) => {
-            let dataset = data::open(config)?;
-            let options = SampleOptions { size: ImageSize::square(16), pose_mode: PoseMode::default() };
-            Sample::load(&dataset.frame(0)?, &options)?;
-            say(format_args!("{}: {} frames, made when asked for", settings.name, dataset.len()))?;
-            Ok(0)
-        }
+    let dataset = data::open(config)?;
+    if let DatasetConfig::Procedural(settings) = config {
+        let options = SampleOptions { size: ImageSize::square(16), pose_mode: PoseMode::default() };
+        Sample::load(&dataset.frame(0)?, &options)?;
+        say(format_args!("{}: {} frames, made when asked for", settings.name, dataset.len()))?;
+        return Ok(0);
     }
+    let report = data::check(&*dataset, images)?;
+    say(format_args!(
+        "{}: {} scenes, {} frames, {} pictures ({} decoded completely), {} views without a picture, {} missing, {} damaged",
+        dataset.name(),
+        report.scenes,
+        report.frames,
+        report.pictures,
+        report.decoded,
+        report.absent_views,
+        report.missing(),
+        report.damaged()
+    ))?;
+    for problem in &report.problems {
+        say(format_args!("  {problem}"))?;
+    }
+    Ok(report.problems.len())
 }

@@ -4,9 +4,7 @@ use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 
-use super::config::NuScenesConfig;
-use super::{NuScenes, SceneDataset};
-use crate::{DataError, ImageSource};
+use crate::{DataError, ImageSource, SceneDataset};
 
 /// What a check of the chosen scenes found.
 #[derive(Debug)]
@@ -15,9 +13,9 @@ pub struct CheckReport {
     pub scenes: usize,
     /// Frames they give.
     pub frames: usize,
-    /// Pictures of those frames, each counted once.
+    /// Pictures and masks of those frames; a file of two frames is counted once.
     pub pictures: usize,
-    /// Views of those frames for which the tables list no picture. No fault: cameras drop pictures.
+    /// Views of those frames for which the dataset lists no picture. No fault: cameras drop pictures.
     pub absent_views: usize,
     /// Pictures decoded completely.
     pub decoded: usize,
@@ -42,20 +40,12 @@ impl CheckReport {
     }
 }
 
-/// Opens the tables, looks at every picture of every frame (existence, size, end) and decodes `decode` pictures of each scene
-/// completely, spread evenly over it.
-///
-/// # Errors
-/// Broken tables and poses; broken pictures are listed in the report.
-pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, DataError> {
-    check_dataset(&NuScenes::open(config)?, decode)
-}
-
-/// The same for any opened dataset.
+/// Looks at every picture and mask of every frame (existence, size, end) and decodes `decode` of them in each scene completely, spread
+/// evenly over it. Pictures that are rendered when asked for are not looked at.
 ///
 /// # Errors
 /// Frames that cannot be read; broken pictures are listed in the report.
-pub fn check_dataset(dataset: &dyn SceneDataset, decode: usize) -> Result<CheckReport, DataError> {
+pub fn check(dataset: &dyn SceneDataset, decode: usize) -> Result<CheckReport, DataError> {
     let scenes = dataset.scene_ranges();
     let mut report = CheckReport {
         scenes: scenes.len(),
@@ -66,28 +56,37 @@ pub fn check_dataset(dataset: &dyn SceneDataset, decode: usize) -> Result<CheckR
         problems: Vec::new(),
     };
     for scene in scenes {
-        let mut pictures = BTreeSet::new();
+        let (mut pictures, mut embedded) = (BTreeSet::new(), Vec::new());
         for index in scene {
             for view in dataset.frame(index)?.views {
-                match view.image {
-                    Some(ImageSource::File { file, size }) => _ = pictures.insert((file, size)),
-                    Some(ImageSource::Rendered { .. } | ImageSource::Embedded { .. }) => {}
-                    None => report.absent_views += 1,
+                report.absent_views += usize::from(view.image.is_none());
+                for source in [view.image, view.mask].into_iter().flatten() {
+                    match source {
+                        ImageSource::File { file, size } => _ = pictures.insert((file, size)),
+                        ImageSource::Embedded { .. } => embedded.push(source),
+                        ImageSource::Rendered { .. } => {}
+                    }
                 }
             }
         }
-        let pictures: Vec<_> = pictures.into_iter().collect();
+        let files = pictures.into_iter().map(|(file, size)| ImageSource::File { file, size });
+        report.look_at(files.chain(embedded).collect(), decode);
+    }
+    Ok(report)
+}
+
+impl CheckReport {
+    /// The pictures of one scene.
+    fn look_at(&mut self, pictures: Vec<ImageSource>, decode: usize) {
         let chosen = decode.min(pictures.len());
         let decoded: BTreeSet<usize> = (0..chosen).map(|i| (2 * i + 1) * pictures.len() / (2 * chosen)).collect();
-        let faults = pictures.into_par_iter().enumerate().map(|(at, (file, size))| {
-            let source = ImageSource::File { file, size };
+        let faults = pictures.into_par_iter().enumerate().map(|(at, source)| {
             let outcome = if decoded.contains(&at) { source.decode().map(drop) } else { source.inspect() };
             (decoded.contains(&at), outcome.err())
         });
         let faults: Vec<_> = faults.collect();
-        report.pictures += faults.len();
-        report.decoded += faults.iter().filter(|fault| fault.0).count();
-        report.problems.extend(faults.into_iter().filter_map(|fault| fault.1));
+        self.pictures += faults.len();
+        self.decoded += faults.iter().filter(|fault| fault.0).count();
+        self.problems.extend(faults.into_iter().filter_map(|fault| fault.1));
     }
-    Ok(report)
 }
