@@ -218,7 +218,7 @@ pub struct OccupancyGrid {
 }
 
 /// Optional parts a dataset can deliver. Asking for an absent one is [`DataError::Unsupported`], not an empty answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Capabilities {
     /// Annotated boxes.
     pub boxes: bool,
@@ -290,6 +290,11 @@ pub trait SceneDataset: Send + Sync {
 
     /// The name it was opened under.
     fn name(&self) -> &str;
+
+    /// What a check should tell beside what the frames show: parts that were asked for and gave no frame, for example.
+    fn notes(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     /// The error for a part this dataset lacks.
     fn unsupported(&self, what: &'static str) -> DataError {

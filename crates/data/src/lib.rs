@@ -5,7 +5,7 @@ mod argoverse2_writer;
 mod augment;
 mod batch;
 mod caption;
-mod check;
+pub mod check;
 mod clip;
 pub mod colmap;
 mod embedded;
@@ -49,7 +49,7 @@ pub use argoverse2_writer::{
 };
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
 pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
-pub use check::{CheckReport, check};
+pub use check::{BatchMemory, CheckOptions, CheckReport, batch_memory, check, check_all};
 pub use clip::{Clip, ClipConfig, ClipMode, Clips};
 pub use embedded::EmbeddedPicture;
 pub use error::DataError;

@@ -21,6 +21,8 @@ pub(crate) enum Purpose {
     BucketOrder = 6,
     /// Where the draws of a class-balanced pass begin; `a` = dataset.
     DrawOffset = 7,
+    /// Pictures of one scene that a check decodes; `a` = scene.
+    Check = 20,
 }
 
 /// The generator for one purpose.

@@ -223,7 +223,8 @@ impl NuScenes {
     }
 }
 
-/// Opens the tables and looks at every picture, see [`crate::check()`].
+/// Opens the tables, looks at every picture of every frame (existence, size, end) and decodes `decode` random pictures of each scene
+/// completely.
 ///
 /// # Errors
 /// Broken tables and poses; broken pictures are listed in the report.
