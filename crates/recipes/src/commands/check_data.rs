@@ -105,22 +105,6 @@ fn look(named: &Named, args: &CheckDataArgs) -> Found {
         Ok(report) => Found { place, error: None, report: Some(report) },
         Err(error) => Found { place, error: Some(error.to_string()), report: None },
     }
-    let report = data::check(&*dataset, images)?;
-    say(format_args!(
-        "{}: {} scenes, {} frames, {} pictures ({} decoded completely), {} views without a picture, {} missing, {} damaged",
-        dataset.name(),
-        report.scenes,
-        report.frames,
-        report.pictures,
-        report.decoded,
-        report.absent_views,
-        report.missing(),
-        report.damaged()
-    ))?;
-    for problem in &report.problems {
-        say(format_args!("  {problem}"))?;
-    }
-    Ok(report.problems.len())
 }
 
 fn print(found: &Found, most_lines: usize) -> anyhow::Result<()> {
