@@ -69,34 +69,35 @@ impl PageContent {
             lacking.push("boxes".to_owned());
         }
         let has = dataset.capabilities();
-        let mut map = LocalMap::default();
-        if asked(Layer::Map) {
-            if has.map {
-                map = dataset.local_map(index, options.range_m)?;
-            } else {
-                lacking.push("map".to_owned());
-            }
-        }
-        let mut occupancy = None;
-        if asked(Layer::Occupancy) || asked(Layer::OccupancyInViews) {
-            occupancy = match has.occupancy.then(|| dataset.occupancy(index)) {
-                Some(Ok(grid)) => Some(grid),
-                None => {
-                    lacking.push("occupancy".to_owned());
-                    None
-                }
-                // Labels exist at some frames only.
-                Some(Err(error @ DataError::Missing { .. })) => {
-                    tracing::warn!("no occupancy labels here: {error}");
-                    lacking.push("occupancy".to_owned());
-                    None
-                }
-                Some(Err(error)) => return Err(error),
-            };
-        }
+        let map = if asked(Layer::Map) {
+            available("map", has.map.then(|| dataset.local_map(index, options.range_m)), &mut lacking)?
+        } else {
+            None
+        };
+        let occupancy = if asked(Layer::Occupancy) || asked(Layer::OccupancyInViews) {
+            available("occupancy", has.occupancy.then(|| dataset.occupancy(index)), &mut lacking)?
+        } else {
+            None
+        };
         if !asked(Layer::Masks) {
             frame.views.iter_mut().for_each(|view| view.mask = None);
         }
-        Ok(Self { frame, map, occupancy, lacking })
+        Ok(Self { frame, map: map.unwrap_or_default(), occupancy, lacking })
     }
+}
+
+/// A layer that exists at some frames of a dataset only: its absence is told, any other fault is an error.
+fn available<T>(
+    what: &str,
+    found: Option<Result<T, DataError>>,
+    lacking: &mut Vec<String>,
+) -> Result<Option<T>, DataError> {
+    match found {
+        Some(Ok(layer)) => return Ok(Some(layer)),
+        Some(Err(error @ DataError::Missing { .. })) => tracing::warn!("no {what} here: {error}"),
+        Some(Err(error)) => return Err(error),
+        None => {}
+    }
+    lacking.push(what.to_owned());
+    Ok(None)
 }

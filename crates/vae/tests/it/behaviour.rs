@@ -256,8 +256,7 @@ fn ignored_pixels_and_absent_views_do_not_enter_the_losses() {
         Tensor::<5>::from_data(TensorData::new(all, [1, 2, 3, 2, 2]), &device)
     };
     let (decoded, target) = (values(|i| if i % 4 == 1 { 100.0 } else { 0.5 }), values(|_| 0.0));
-    let counted =
-        Tensor::<5>::from_data(TensorData::new(vec![1.0f32, 0.0, 1.0, 1.0].repeat(2), [1, 2, 1, 2, 2]), &device);
+    let counted = Tensor::<5>::from_data(TensorData::new([1.0f32, 0.0, 1.0, 1.0].repeat(2), [1, 2, 1, 2, 2]), &device);
     let mask = |second: bool| Tensor::<2, Bool>::from_data(TensorData::new(vec![true, second], [1, 2]), &device);
     let loss = |mask, counted| masked_l2(decoded.clone(), target.clone(), mask, counted).into_scalar::<f32>();
     assert_eq!(loss(mask(true), Some(counted.clone())), 0.25);
