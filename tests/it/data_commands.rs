@@ -106,6 +106,31 @@ fn pages_show_every_rig() {
 }
 
 #[test]
+fn every_layout_that_is_made_is_found_sound() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = ["--scenes", "1", "--key-frames", "12", "--scale", "0.05"];
+    for (format, settings) in [
+        ("nuscenes", &["version=v1.0-mini"][..]),
+        ("argoverse2", &[]),
+        ("nuplan", &["split=mini"]),
+        ("wayve_scenes101", &["split=all"]),
+        ("waymo", &["release=v2"]),
+    ] {
+        let out = text(&folder.path().join(format));
+        must(rigscape(&[&["make-data", "--format", format, "--out", &out], &small[..]].concat()));
+        let mut check = vec!["check-data", "--kind", format, "--root", &out, "--images", "3"];
+        settings.iter().for_each(|setting| check.extend(["--set", setting]));
+        let told = must(rigscape(&check));
+        assert!(told.contains("training could start"), "{format}: {told}");
+        let again = rigscape(&[&["make-data", "--format", format, "--out", &out], &small[..]].concat());
+        assert!(!again.status.success(), "{format} was overwritten");
+    }
+    let refused =
+        rigscape(&["make-data", "--format", "waymo", "--size", "64x36", "--out", &text(&folder.path().join("x"))]);
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("--scale"));
+}
+
+#[test]
 fn frames_are_found_by_scene_and_time() {
     let folder = tempfile::tempdir().unwrap();
     let out = text(&folder.path().join("page.jpg"));

@@ -37,6 +37,8 @@ pub enum RigSource {
     Preset(RigPreset),
     /// A JSON file holding a [`CameraRig`].
     File(PathBuf),
+    /// The cameras themselves.
+    Cameras(CameraRig),
 }
 
 /// Settings of a [`Procedural`] dataset.
@@ -121,6 +123,7 @@ impl Procedural {
         let mut rig = match &config.rig {
             RigSource::Preset(preset) => preset.rig(),
             RigSource::File(path) => read_rig(path)?,
+            RigSource::Cameras(rig) => rig.clone(),
         };
         if let Some(unknown) = config.cameras.iter().find(|name| rig.cameras.iter().all(|c| c.channel != **name)) {
             let known: Vec<&str> = rig.cameras.iter().map(|c| c.channel.as_str()).collect();
