@@ -45,8 +45,8 @@ impl DeviceConfig {
         }
     }
 
-    /// How many micro batches of one step should be computed side by side: at least two threads' worth on flex, which leaves cores idle
-    /// with one; one on a GPU, which is busy with it, and on ndarray, which is for comparisons.
+    /// How many micro batches of one step should be computed side by side: one per thread on flex, at least two; one on a GPU, which is
+    /// busy with it, and on ndarray, which is for comparisons.
     pub fn lanes(self) -> usize {
         match self {
             Self::Flex => rayon::current_num_threads().max(2),
