@@ -22,6 +22,7 @@ mod product;
 mod rotary;
 mod sampling;
 mod softmax;
+mod sums;
 
 pub use activation::{gelu, silu};
 pub use attention::{attention, rotary_attention};
@@ -35,3 +36,4 @@ pub use sampling::{
     grid_sample_3d,
 };
 pub use softmax::softmax;
+pub use sums::{mean_dim, sum_dim};

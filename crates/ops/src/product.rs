@@ -71,7 +71,10 @@ pub(crate) fn product(out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f
     let (m, n, k) = (a.rows, b.columns, a.columns);
     assert_eq!((out.rows, out.columns, b.rows), (m, n, k), "shapes of a matrix product");
     for (x, what) in [(&a, "left"), (&b, "right")] {
-        assert!(extent(x.rows, x.columns, x.row_stride, x.column_stride) <= x.data.len(), "{what} matrix leaves its slice");
+        assert!(
+            extent(x.rows, x.columns, x.row_stride, x.column_stride) <= x.data.len(),
+            "{what} matrix leaves its slice"
+        );
     }
     assert!(extent(m, n, out.row_stride, out.column_stride) <= out.data.len(), "result leaves its slice");
     let (long, short, inner) = if out.row_stride >= out.column_stride {
@@ -83,8 +86,7 @@ pub(crate) fn product(out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f
     if m == 0 || n == 0 {
         return;
     }
-    let parallelism =
-        if m * n * k >= PARALLEL_FROM { gemm::Parallelism::Rayon(0) } else { gemm::Parallelism::None };
+    let parallelism = if m * n * k >= PARALLEL_FROM { gemm::Parallelism::Rayon(0) } else { gemm::Parallelism::None };
     #[allow(unsafe_code)]
     // SAFETY: every index that the strides reach lies inside its slice and the result's elements do not overlap, both checked above; the
     // borrows rule out that the result overlaps an input.
@@ -148,7 +150,13 @@ mod tests {
     fn a_matrix_must_fit_its_slice() {
         let data = [0.0; 6];
         let mut out = [0.0; 4];
-        product(MatrixMut::row_major(&mut out, 2, 2), Matrix::row_major(&data, 2, 4), Matrix::row_major(&data, 4, 2), 1.0, Old::Replaced);
+        product(
+            MatrixMut::row_major(&mut out, 2, 2),
+            Matrix::row_major(&data, 2, 4),
+            Matrix::row_major(&data, 4, 2),
+            1.0,
+            Old::Replaced,
+        );
     }
 
     #[test]

@@ -13,7 +13,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::checkpoint::{CheckpointReader, CheckpointWriter};
-use crate::params::{NamedTensor, NamedTensors, ParamInfo, inner_device, list_parameters, map_with_gradients};
+use crate::lanes::for_each_job;
+use crate::params::{
+    NamedTensor, NamedTensors, ParamInfo, inner_device, list_parameters, map_parameters, map_with_gradients,
+};
 use crate::schedule::Schedule;
 use crate::update::GradientClip;
 use crate::weights::WeightDiff;
@@ -152,9 +155,23 @@ impl AdamW {
     /// counts the updates of that parameter from 1.
     #[must_use]
     pub fn step<M: Module>(&mut self, module: M, grads: &mut GradientsParams, learning_rate: f64) -> M {
-        map_with_gradients(module, grads, |info, values, grad| {
-            self.update(info, values, grad, learning_rate * self.factor(&info.path))
-        })
+        let mut jobs = Vec::new();
+        let module = map_with_gradients(module, grads, |info, values, grad| {
+            jobs.push((info.clone(), values.clone(), grad, self.state.remove(&info.path)));
+            values
+        });
+        let Some(device) = inner_device(&module) else { return module };
+        let this = &*self;
+        let updated = for_each_job(&device, jobs, |(info, values, grad, old)| {
+            let (values, moments) = this.update(&info, values, grad, old, learning_rate * this.factor(&info.path));
+            (info.path, values, moments)
+        });
+        let mut new_values = BTreeMap::new();
+        for (path, values, moments) in updated {
+            self.state.insert(path.clone(), moments);
+            new_values.insert(path, values);
+        }
+        map_parameters(module, |info, values| new_values.remove(&info.path).unwrap_or(values))
     }
 
     /// Factor on the learning rate of the parameter at `path`.
@@ -163,11 +180,18 @@ impl AdamW {
         matching.max_by_key(|(prefix, _)| prefix.len()).map_or(1.0, |(_, &factor)| factor)
     }
 
-    fn update(&mut self, info: &ParamInfo, values: Tensor<1>, grad: Tensor<1>, learning_rate: f64) -> Tensor<1> {
+    fn update(
+        &self,
+        info: &ParamInfo,
+        values: Tensor<1>,
+        grad: Tensor<1>,
+        old: Option<Moments>,
+        learning_rate: f64,
+    ) -> (Tensor<1>, Moments) {
         let [beta1, beta2] = self.betas;
         let fresh_first = grad.clone().mul_scalar(1.0 - beta1);
         let fresh_second = grad.clone().mul(grad).mul_scalar(1.0 - beta2);
-        let (first, second, updates) = match self.state.remove(&info.path) {
+        let (first, second, updates) = match old {
             Some(old) => {
                 let first = old.first.mul_scalar(beta1).add(fresh_first);
                 (first, old.second.mul_scalar(beta2).add(fresh_second), old.updates + 1)
@@ -179,8 +203,7 @@ impl AdamW {
         let change = first.clone().mul_scalar(learning_rate / correction(beta1)).div(root);
         let decay = learning_rate * self.weight_decay;
         let values = if decay != 0.0 && self.scope.covers(info) { values.mul_scalar(1.0 - decay) } else { values };
-        self.state.insert(info.path.clone(), Moments { shape: info.shape.clone(), first, second, updates });
-        values.sub(change)
+        (values.sub(change), Moments { shape: info.shape.clone(), first, second, updates })
     }
 
     /// Moments by name: `first.<path>` and `second.<path>`.

@@ -74,7 +74,7 @@ impl RayAttention {
         let logits = self.depth.forward(query).reshape([b * v, depths, rays_per_view]);
         let share = depth_weights(logits, rays.valid.clone().reshape([b * v, depths, rays_per_view]));
         let gathered = gathered.reshape([b * v, depths, rays_per_view, c]);
-        let summed = (gathered * share.unsqueeze_dim::<4>(3)).sum_dim(1);
+        let summed = ops::sum_dim(gathered * share.unsqueeze_dim::<4>(3), 1);
         self.out.forward(summed.reshape([b, v, rays_per_view, c]))
     }
 }
@@ -205,7 +205,7 @@ impl SceneDecoder {
     pub fn collapse(&self, points: Tensor<4>, depths: usize) -> Tensor<3> {
         let [b, v, n, c] = points.dims();
         let rays = n / depths;
-        let mean = points.reshape([b * v, depths, rays, c]).mean_dim(1).reshape([b * v, rays, c]);
+        let mean = ops::mean_dim(points.reshape([b * v, depths, rays, c]), 1).reshape([b * v, rays, c]);
         self.norm.forward(mean)
     }
 }

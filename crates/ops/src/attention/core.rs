@@ -71,11 +71,8 @@ pub(super) fn attend_backward(
 ) -> HeadGradients {
     let (keys, d, width) = (head.k.rows, head.q.columns, head.v.columns);
     let scale = 1.0 / (d as f32).sqrt();
-    let mut gradients = HeadGradients {
-        q: vec![0.0; (last - first) * d],
-        k: vec![0.0; keys * d],
-        v: vec![0.0; keys * width],
-    };
+    let mut gradients =
+        HeadGradients { q: vec![0.0; (last - first) * d], k: vec![0.0; keys * d], v: vec![0.0; keys * width] };
     if keys == 0 {
         return gradients;
     }

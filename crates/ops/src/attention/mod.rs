@@ -40,7 +40,8 @@ pub fn attention(q: Tensor<4>, k: Tensor<4>, v: Tensor<4>, mask: Option<Tensor<4
         assert!(fits, "mask {:?} does not broadcast to {:?}", mask.dims(), [b, h, n, keys]);
     }
     if on_flex(&q) {
-        let kernel = Attention { heads: [b, h], sizes: [n, keys, d, v.dims()[3]], mask: mask.map(|m| Mask::new(m, keys)) };
+        let kernel =
+            Attention { heads: [b, h], sizes: [n, keys, d, v.dims()[3]], mask: mask.map(|m| Mask::new(m, keys)) };
         return fused_3(kernel, q, k, v);
     }
     let scale = 1.0 / (d as f32).sqrt();

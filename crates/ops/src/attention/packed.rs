@@ -115,7 +115,15 @@ impl PackedAttention {
             let (x, gain) = (self.part(inputs[0], at, part), inputs[1 + part]);
             let mut gain_gradient = vec![0.0; d];
             let tables = [cos, sin];
-            normalise_and_rotate_backward(x.data, x.row_stride, gain, tables, self.eps, &mut gradient, &mut gain_gradient);
+            normalise_and_rotate_backward(
+                x.data,
+                x.row_stride,
+                gain,
+                tables,
+                self.eps,
+                &mut gradient,
+                &mut gain_gradient,
+            );
             (gradient, gain_gradient)
         };
         let ((q, query_gain), (k, key_gain)) = (back(0, through.q), back(1, through.k));

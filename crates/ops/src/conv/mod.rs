@@ -34,8 +34,7 @@ pub fn conv2d(
     if !on_flex(&x) {
         return stock_conv2d(x, weight, bias, ConvOptions::new(stride, padding, [1, 1], 1));
     }
-    let window =
-        Window::new([1, h, w], [1, kh, kw], [1, stride[0], stride[1]], [0, padding[0], padding[1]]);
+    let window = Window::new([1, h, w], [1, kh, kw], [1, stride[0], stride[1]], [0, padding[0], padding[1]]);
     let [_, out_h, out_w] = window.output;
     let kernel = Convolution { output_shape: vec![b, c_out, out_h, out_w], c_in, c_out, window };
     match bias {
