@@ -180,9 +180,9 @@ fn rows(linear: &DMat3, offset: DVec3) -> [[f64; 4]; 3] {
 fn planar(image: &RgbImage) -> Vec<f32> {
     let plane = image.width() as usize * image.height() as usize;
     let mut out = vec![0.0; 3 * plane];
-    for (i, pixel) in image.pixels().enumerate() {
-        for (channel, value) in pixel.0.into_iter().enumerate() {
-            out[channel * plane + i] = f32::from(value) / 255.0;
+    for (channel, plane) in out.chunks_exact_mut(plane.max(1)).enumerate() {
+        for (value, pixel) in plane.iter_mut().zip(image.as_raw().chunks_exact(3)) {
+            *value = f32::from(pixel[channel]) / 255.0;
         }
     }
     out
