@@ -96,6 +96,31 @@ fn check_target(target: &Path, force: bool) -> Result<(), DataError> {
     Ok(())
 }
 
+/// Names become parts of paths and keys: plain and different from each other.
+pub(crate) fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
+    let mut sorted: Vec<&String> = names.iter().collect();
+    sorted.sort();
+    if let Some(twice) = sorted.windows(2).find(|pair| pair[0] == pair[1]) {
+        return Err(DataError::Config(format!("{what} {:?} occurs twice", twice[0])));
+    }
+    let plain = |name: &str| {
+        !name.is_empty()
+            && !name.starts_with('.')
+            && name.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.'))
+    };
+    match names.iter().find(|name| !plain(name)) {
+        Some(name) => {
+            Err(DataError::Config(format!("{what} {name:?} may hold letters, digits, '-', '_' and '.' only")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Lower-case hexadecimal digits.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

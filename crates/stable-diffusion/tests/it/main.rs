@@ -1,0 +1,10 @@
+//! Integration tests of the latent diffusion networks.
+
+mod controlnet;
+mod cross_view;
+mod folder;
+mod full_size;
+mod golden;
+mod single_file;
+mod unet;
+mod vae;
