@@ -28,6 +28,13 @@ pub enum ImageSource {
         /// Width and height the calibration announces.
         size: (u32, u32),
     },
+    /// A picture that is in memory, such as a generated one.
+    Memory {
+        /// The picture.
+        picture: Arc<RgbImage>,
+        /// Width and height the calibration announces.
+        size: (u32, u32),
+    },
     /// A camera in the procedural world; rendered exactly at the asked size.
     Rendered {
         /// The world at one instant.
@@ -48,7 +55,7 @@ thread_local! {
 impl ImageSource {
     /// The edited picture, RGB8 of the edit's size.
     ///
-    /// A file is decoded and resampled (area average when shrinking); a rendered source casts its rays through the edited
+    /// A stored picture is decoded and resampled (area average when shrinking); a rendered source casts its rays through the edited
     /// camera, so no resampling takes place.
     ///
     /// # Errors
@@ -57,6 +64,7 @@ impl ImageSource {
     pub fn load(&self, edit: &ImageEdit) -> Result<RgbImage, DataError> {
         match self {
             Self::Rendered { snapshot, camera, world_from_cam } => render(snapshot, camera, world_from_cam, edit),
+            Self::Memory { picture, size } => resample(sized(picture, *size)?, edit),
             Self::File { .. } | Self::Embedded { .. } => {
                 let raw = self.decode_into(SCRATCH.take())?;
                 let edited = resample(&raw, edit);
@@ -66,7 +74,7 @@ impl ImageSource {
         }
     }
 
-    /// A picture file's own pixels; a rendered source gives its raw camera's picture.
+    /// A stored picture's own pixels; a rendered source gives its raw camera's picture.
     ///
     /// # Errors
     /// As [`ImageSource::load`].
@@ -79,6 +87,7 @@ impl ImageSource {
         match self {
             Self::File { file, size } => decode_bytes(&file.bytes()?, *size, file.path(), pixels),
             Self::Embedded { picture, size } => decode_bytes(&picture.bytes()?, *size, picture.path(), pixels),
+            Self::Memory { picture, size } => sized(picture, *size).cloned(),
             Self::Rendered { snapshot, camera, world_from_cam } => {
                 let edit = ImageEdit::identity(camera.intrinsics.width, camera.intrinsics.height);
                 render(snapshot, camera, world_from_cam, &edit)
@@ -94,16 +103,17 @@ impl ImageSource {
         match self {
             Self::File { file, size } => inspect_file(file, *size),
             Self::Embedded { picture, size } => inspect_bytes(&picture.bytes()?, *size, picture.path()),
+            Self::Memory { picture, size } => sized(picture, *size).map(drop),
             Self::Rendered { .. } => Ok(()),
         }
     }
 
-    /// The bytes of a JPEG as they are stored, [inspected](ImageSource::inspect); `None` for other formats and rendered sources.
+    /// The bytes of a JPEG as they are stored, [inspected](ImageSource::inspect); `None` for everything else.
     pub(crate) fn jpeg_bytes(&self) -> Result<Option<Vec<u8>>, DataError> {
         let (bytes, size, path) = match self {
             Self::File { file, size } => (file.bytes()?, size, file.path()),
             Self::Embedded { picture, size } => (picture.bytes()?, size, picture.path()),
-            Self::Rendered { .. } => return Ok(None),
+            Self::Memory { .. } | Self::Rendered { .. } => return Ok(None),
         };
         inspect_bytes(&bytes, *size, path)?;
         Ok(jpeg::is_jpeg(&bytes).then_some(bytes))
@@ -123,6 +133,12 @@ fn render(
     let rendering = snapshot.render_serial(&camera, world_from_cam, &world::RenderOptions::default());
     RgbImage::from_raw(rendering.width, rendering.height, rendering.rgb)
         .ok_or_else(|| DataError::Config("the renderer returned a picture of another size".to_owned()))
+}
+
+/// A picture in memory, checked as a file's would be.
+fn sized(picture: &RgbImage, want: (u32, u32)) -> Result<&RgbImage, DataError> {
+    let got = picture.dimensions();
+    if got == want { Ok(picture) } else { Err(DataError::ImageSize { got, want, path: "a picture in memory".into() }) }
 }
 
 /// All pixels of a picture whose size is known from its table; checked against the file's header before a pixel buffer is reserved. A JPEG

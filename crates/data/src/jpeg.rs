@@ -3,7 +3,7 @@
 //!
 //! Pictures are decoded whole, also for a network that sees a twentieth of their pixels: most of the time goes into Huffman codes, which
 //! a decoder of half size must read as well, and the one in pure Rust takes a scan that ends early for a whole one.
-//! `examples/feed_speed.rs` has the figures.
+//! `benches/RESULTS.md` has the figures.
 
 use std::path::Path;
 

@@ -1,19 +1,19 @@
 //! What to read: folders, split, cameras, windows.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use crate::DataError;
+use crate::store::Roots;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the nuPlan reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NuPlanConfig {
-    /// Folder or archive that holds the databases and the pictures.
-    pub root: PathBuf,
+    /// Folder or archive that holds the databases and the pictures; or a list of both: the release comes in pieces.
+    pub root: Roots,
     /// Folder of the databases below `root`; they lie in it or in its direct subfolders (`mini`, `trainval`, `test`).
     #[serde(default = "default_databases")]
     pub databases: String,
@@ -57,7 +57,7 @@ pub struct NuPlanConfig {
 
 impl NuPlanConfig {
     /// The defaults for a dataset folder: every log with pictures, every camera.
-    pub fn new(root: impl Into<PathBuf>) -> Self {
+    pub fn new(root: impl Into<Roots>) -> Self {
         Self {
             root: root.into(),
             databases: default_databases(),

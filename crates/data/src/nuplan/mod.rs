@@ -71,7 +71,7 @@ impl NuPlan {
     /// Every broken database, with its file and the row: see [`DataError`]. [`DataError::Empty`] for a split without a log that has pictures.
     pub fn open(config: &NuPlanConfig) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let files = logs::find_logs(config, &store)?;
         let read: Vec<Option<Log>> =
             files.par_iter().map(|file| logs::read_log(config, &store, file)).collect::<Result<_, _>>()?;

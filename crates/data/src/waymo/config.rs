@@ -1,20 +1,20 @@
 //! What to read: folder, release, split, cameras.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use super::cameras;
 use crate::DataError;
+use crate::store::Roots;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the Waymo reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WaymoConfig {
-    /// Folder that holds the splits.
-    pub root: PathBuf,
+    /// Folder or archive that holds the splits; or a list of both.
+    pub root: Roots,
     /// How the files are stored.
     pub release: WaymoRelease,
     /// Folder of the split below `root`: `training`, `validation`, `testing`, ...; `"."` where `root` is the split itself.
@@ -50,7 +50,7 @@ pub enum WaymoRelease {
 
 impl WaymoConfig {
     /// The defaults for a folder and release: every segment of the training split, every camera.
-    pub fn new(root: impl Into<PathBuf>, release: WaymoRelease) -> Self {
+    pub fn new(root: impl Into<Roots>, release: WaymoRelease) -> Self {
         Self {
             root: root.into(),
             release,

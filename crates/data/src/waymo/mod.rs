@@ -64,7 +64,7 @@ impl Waymo {
     /// Whatever is wrong with what was read, naming the file; [`DataError::Empty`] for a split without a frame.
     pub fn open(config: &WaymoConfig) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let segments = match config.release {
             WaymoRelease::V1 => Segments::V1 { list: records::open(config, &store)?, maps: Recent::default() },
             WaymoRelease::V2 => Segments::V2(components::open(config, &store)?),

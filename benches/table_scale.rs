@@ -1,6 +1,6 @@
 //! Measures how long the nuScenes tables take to open, what they need, and how fast a frame's records are found in them.
 //!
-//! `cargo run --release -p data --example table_scale -- ROOT [--version v1.0-trainval] [--all] [--frames N]`
+//! `cargo bench -p data --bench table_scale -- --root DIR [--version v1.0-trainval] [--all] [--frames N]`
 //!
 //! Only the tables are needed, no pictures. `--all` takes every set of pictures (12 Hz) instead of the key frames.
 
@@ -13,7 +13,7 @@ use data::nuscenes::{FrameChoice, NuScenes, NuScenesConfig};
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let value = |name: &str| arguments.iter().position(|a| a == name).and_then(|i| arguments.get(i + 1));
-    let root = arguments.first().filter(|first| !first.starts_with("--")).expect("the first argument is the folder");
+    let root = value("--root").expect("--root names the folder that holds the tables");
     let version = value("--version").map_or("v1.0-trainval", String::as_str);
     let frames: usize = value("--frames").map_or(20_000, |v| v.parse().expect("--frames takes a number"));
     let mut config = NuScenesConfig::new(root, version);

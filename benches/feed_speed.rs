@@ -1,6 +1,6 @@
 //! Measures how fast pictures are fed to training: six 1600x900 JPEG views a frame, brought to 256x256.
 //!
-//! `cargo run --release -p data --example feed_speed -- [--pictures DIR] [--seconds S]`
+//! `cargo bench -p data --bench feed_speed -- [--pictures DIR] [--seconds S]`
 //!
 //! DIR is searched for JPEG files of that size (a nuScenes `samples` folder). Without it the six pictures of the test data under
 //! `RIGSCAPE_DATA` are taken, and without those six rendered ones. All of them lie in the page cache after the first round.
