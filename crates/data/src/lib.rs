@@ -28,6 +28,7 @@ mod parquet_file;
 mod pass;
 mod permutation;
 pub mod pickle;
+mod polygon;
 mod procedural;
 mod procedural_cache;
 mod registry;

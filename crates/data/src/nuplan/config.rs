@@ -20,6 +20,9 @@ pub struct NuPlanConfig {
     /// Folder of the pictures below `root`.
     #[serde(default = "default_sensor_blobs")]
     pub sensor_blobs: String,
+    /// Folder of the city maps below `root`; without it the dataset has no maps.
+    #[serde(default = "default_maps")]
+    pub maps: String,
     /// An official list of logs (`train`, `val`, `test`), `mini` for the logs of the subfolder of that name, or `all`.
     #[serde(default = "default_split")]
     pub split: String,
@@ -62,6 +65,7 @@ impl NuPlanConfig {
             root: root.into(),
             databases: default_databases(),
             sensor_blobs: default_sensor_blobs(),
+            maps: default_maps(),
             split: default_split(),
             logs: Vec::new(),
             cameras: Vec::new(),
@@ -104,6 +108,10 @@ fn default_databases() -> String {
 
 fn default_sensor_blobs() -> String {
     "nuplan-v1.1/sensor_blobs".to_owned()
+}
+
+fn default_maps() -> String {
+    "maps".to_owned()
 }
 
 fn default_split() -> String {
