@@ -53,6 +53,14 @@ thread_local! {
 }
 
 impl ImageSource {
+    /// Width and height of the raw picture, px.
+    pub fn size(&self) -> (u32, u32) {
+        match self {
+            Self::File { size, .. } | Self::Embedded { size, .. } | Self::Memory { size, .. } => *size,
+            Self::Rendered { camera, .. } => (camera.intrinsics.width, camera.intrinsics.height),
+        }
+    }
+
     /// The edited picture, RGB8 of the edit's size.
     ///
     /// A stored picture is decoded and resampled (area average when shrinking); a rendered source casts its rays through the edited
