@@ -62,6 +62,9 @@ impl NuScenesExportConfig {
 /// The manifest of an export; its scenes are their names.
 pub type NuScenesExportManifest = WriterManifest<NuScenesExportConfig, String>;
 
+/// From the number of a frame and the frame to a picture for each of its views.
+pub type NewPictures<'a> = dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<ImageSource>>, DataError> + 'a;
+
 /// Writes the dataset again with other pictures.
 ///
 /// `pictures` is asked for each frame in order and gives one entry for each of its views, in their order; `None` leaves a picture out.
@@ -74,7 +77,7 @@ pub type NuScenesExportManifest = WriterManifest<NuScenesExportConfig, String>;
 pub fn export_nuscenes(
     source: &NuScenes,
     config: &NuScenesExportConfig,
-    pictures: &mut dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<ImageSource>>, DataError>,
+    pictures: &mut NewPictures<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<NuScenesExportManifest, DataError> {
     if !(1..=100).contains(&config.jpeg_quality) {

@@ -28,7 +28,7 @@ pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
 pub use can_bus::{CanBus, CanMessage, CanSignal, CanState};
 pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
-pub use export::{NuScenesExportConfig, NuScenesExportManifest, export_nuscenes};
+pub use export::{NewPictures, NuScenesExportConfig, NuScenesExportManifest, export_nuscenes};
 
 use annotations::Annotations;
 use expansions::Expansions;

@@ -85,7 +85,7 @@ fn written_labels_are_read_back_and_are_the_same_every_time() {
     let dir = tempfile::tempdir().unwrap();
     let path = write_occ3d(dir.path(), "scene-1077", "token", &grid).unwrap();
     assert_eq!(Occ3d::open(dir.path(), true).unwrap().read("scene-1077", "token").unwrap(), grid);
-    assert_eq!(Occ3d::open(&dir.path().join("gts"), true).unwrap().read("scene-1077", "token").unwrap(), grid);
+    assert_eq!(Occ3d::open(dir.path().join("gts"), true).unwrap().read("scene-1077", "token").unwrap(), grid);
     let again = write_occ3d(dir.path(), "scene-1077", "other", &grid).unwrap();
     assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(again).unwrap());
     assert!(matches!(write_occ3d(dir.path(), "scene-1077", "token", &grid), Err(DataError::Io { .. })));

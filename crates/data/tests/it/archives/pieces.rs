@@ -33,7 +33,7 @@ fn pieces(whole: &Path, is_first: impl Fn(&str) -> bool, check: impl Fn(Roots)) 
 
 /// Everything but the pictures' places is equal, and so are the pictures.
 fn same(a: &dyn SceneDataset, b: &dyn SceneDataset) {
-    assert!(a.len() > 0);
+    assert!(!a.is_empty());
     assert_eq!((a.len(), a.scene_ranges(), a.capabilities()), (b.len(), b.scene_ranges(), b.capabilities()));
     for index in 0..a.len() {
         let (a, b) = (a.frame(index).unwrap(), b.frame(index).unwrap());
