@@ -1,16 +1,32 @@
-//! One shape from overlapping and touching polygons.
+//! Polygons of maps, and one shape from overlapping and touching ones.
 
 use geometry::glam::DVec2;
 use i_overlay::core::fill_rule::FillRule;
 use i_overlay::float::simplify::SimplifyShape;
 
-use super::MapPolygon;
+use crate::local_map::contains;
+
+/// A polygon; rings do not repeat their first point.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct MapPolygon {
+    /// Outer ring, metres.
+    pub outer: Vec<DVec2>,
+    /// Inner rings, metres.
+    pub holes: Vec<Vec<DVec2>>,
+}
+
+impl MapPolygon {
+    /// Whether a point lies in it and in none of its holes.
+    pub fn contains(&self, point: DVec2) -> bool {
+        contains(&self.outer, point) && !self.holes.iter().any(|hole| contains(hole, point))
+    }
+}
 
 /// Holes and shapes that enclose less lie between polygons that should touch, square metres.
 const SLIVER_M2: f64 = 0.01;
 
 /// The union. Outer rings run counter-clockwise, holes clockwise.
-pub(super) fn union<'a>(polygons: impl Iterator<Item = &'a MapPolygon>) -> Vec<MapPolygon> {
+pub(crate) fn union<'a>(polygons: impl Iterator<Item = &'a MapPolygon>) -> Vec<MapPolygon> {
     let mut rings: Vec<Vec<[f64; 2]>> = Vec::new();
     for polygon in polygons {
         rings.push(turned(&polygon.outer, 1.0));
@@ -36,7 +52,7 @@ fn turned(ring: &[DVec2], sign: f64) -> Vec<[f64; 2]> {
 }
 
 /// Positive for counter-clockwise rings, square metres.
-pub(super) fn doubled_area(ring: &[DVec2]) -> f64 {
+pub(crate) fn doubled_area(ring: &[DVec2]) -> f64 {
     ring.iter().zip(ring.iter().cycle().skip(1)).map(|(a, b)| a.perp_dot(*b)).sum()
 }
 
