@@ -13,7 +13,7 @@ const ARROWS: [(&str, &[&str]); 13] = [
     ("ops", &[]),
     ("nn", &["pickle", "ops"]),
     ("diffusion", &[]),
-    ("features", &["nn", "ops"]),
+    ("features", &["ops", "nn"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
     ("stable-diffusion", &["nn", "ops"]),
     ("metrics", &["features"]),

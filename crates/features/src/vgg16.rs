@@ -89,7 +89,7 @@ pub struct Vgg16 {
 }
 
 impl Vgg16 {
-    /// Loads a safetensors file in one of two layouts, told apart by the names: torchvision's
+    /// Loads a safetensors or torch file in one of two layouts, told apart by the names: torchvision's
     /// (`features.{0,2,5,…}.{weight,bias}`, [`Preprocessing::Torchvision`]; a classifier beside them is not read) or
     /// the Oxford release's (`block{b}_conv{c}.{weight,bias}`, [`Preprocessing::Caffe`]).
     ///

@@ -69,7 +69,7 @@ fn every_other_kind_decodes() {
         assert_eq!(items[3].long_digits(), Some(&b"123456789\x01"[..]));
         assert_eq!(items[14].persistent_id().unwrap().integer(), Some(5));
     });
-    let bytes = [b"\x80\x02", &body[..]].concat();
+    let bytes = [b"\x80\x02", body].concat();
     let (graph, _) = decode_objects(&bytes, LIMITS).unwrap();
     assert_eq!(graph.persistent_ids().map(|id| id.integer()).collect::<Vec<_>>(), [Some(5)]);
 }
@@ -117,7 +117,7 @@ fn damage_and_excess_are_refused() {
 fn random_and_mutated_graphs_never_panic_and_stay_small() {
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let sound: [&[u8]; 2] = [
-        b"\x80\x02ccollections\nOrderedDict\nq\0)Rq\x01X\x01\0\0\0actorch._utils\n_rebuild_tensor_v2\n((X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\00X\x03\0\0\0cpuK\x04tQK\0K\x02K\x02\x86K\x02K\x01\x86\x89h\0)RtRs.",
+        b"\x80\x02ccollections\nOrderedDict\nq\0)Rq\x01X\x01\0\0\0actorch._utils\n_rebuild_tensor_v2\n((X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\x000X\x03\0\0\0cpuK\x04tQK\0K\x02K\x02\x86K\x02K\x01\x86\x89h\0)RtRs.",
         b"\x80\x04}(\x8c\x05epochK\x01\x8c\x05stateccallbacks\nA\n)\x81}\x8c\x01xC\x02abs.",
     ];
     let opcodes =

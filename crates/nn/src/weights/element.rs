@@ -8,8 +8,11 @@ pub(super) fn width(dtype: Dtype) -> usize {
     dtype.bitsize() / 8
 }
 
+/// Appends the elements of some bytes.
+pub(super) type Widen<T> = fn(&[u8], &mut Vec<T>);
+
 /// How elements of a float type become f32; none for other types.
-pub(super) fn widen(dtype: Dtype) -> Option<fn(&[u8], &mut Vec<f32>)> {
+pub(super) fn widen(dtype: Dtype) -> Option<Widen<f32>> {
     Some(match dtype {
         Dtype::F64 => |bytes, out| out.extend(bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b) as f32)),
         Dtype::F32 => |bytes, out| out.extend(bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b))),
@@ -20,7 +23,7 @@ pub(super) fn widen(dtype: Dtype) -> Option<fn(&[u8], &mut Vec<f32>)> {
 }
 
 /// How elements of an integer type become i64; none for other types.
-pub(super) fn integers_of(dtype: Dtype) -> Option<fn(&[u8], &mut Vec<i64>)> {
+pub(super) fn integers_of(dtype: Dtype) -> Option<Widen<i64>> {
     Some(match dtype {
         Dtype::BOOL | Dtype::U8 => |bytes, out| out.extend(bytes.iter().map(|b| i64::from(*b))),
         Dtype::I8 => |bytes, out| out.extend(bytes.iter().map(|b| i64::from(b.cast_signed()))),

@@ -8,7 +8,7 @@ use std::sync::{Mutex, PoisonError};
 
 use safetensors::Dtype;
 
-use super::element::{integers_of, widen, width};
+use super::element::{Widen, integers_of, widen, width};
 use super::{HostTensor, WeightError, safetensors_file, torch};
 
 /// Bytes converted at a time, so that a large tensor is not in memory twice. A multiple of every element size.
@@ -156,7 +156,7 @@ impl WeightFile {
         Ok((entry.shape.clone(), self.values(entry, widen)?))
     }
 
-    fn values<T: Copy>(&self, entry: &Entry, widen: fn(&[u8], &mut Vec<T>)) -> Result<Vec<T>, WeightError> {
+    fn values<T: Copy>(&self, entry: &Entry, widen: Widen<T>) -> Result<Vec<T>, WeightError> {
         let read = self.read_span(entry, widen);
         let values = read.map_err(|source| WeightError::Io { source, path: self.path.clone() })?;
         Ok(match &entry.strides {
@@ -165,7 +165,7 @@ impl WeightFile {
         })
     }
 
-    fn read_span<T>(&self, entry: &Entry, widen: fn(&[u8], &mut Vec<T>)) -> std::io::Result<Vec<T>> {
+    fn read_span<T>(&self, entry: &Entry, widen: Widen<T>) -> std::io::Result<Vec<T>> {
         let mut data = Vec::with_capacity(entry.span);
         let mut left = entry.span * width(entry.dtype);
         let mut chunk = vec![0; CHUNK_BYTES.min(left)];
