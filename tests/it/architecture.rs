@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The only arrows allowed, as in crates/README.md. `recipes` is the root package.
-const ARROWS: [(&str, &[&str]); 11] = [
+const ARROWS: [(&str, &[&str]); 12] = [
     ("geometry", &[]),
     ("world", &["geometry"]),
     ("data", &["geometry", "world"]),
@@ -14,6 +14,7 @@ const ARROWS: [(&str, &[&str]); 11] = [
     ("diffusion", &[]),
     ("features", &["nn"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
+    ("stable-diffusion", &["nn", "ops"]),
     ("metrics", &["features"]),
     ("train", &[]),
     ("rigscape", &["geometry", "world", "data", "ops", "nn", "features", "vae", "metrics", "train"]),

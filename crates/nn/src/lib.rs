@@ -4,6 +4,7 @@ pub mod golden;
 mod init;
 pub mod layout;
 mod linear;
+pub mod lora;
 mod norm;
 mod position;
 mod transformer;

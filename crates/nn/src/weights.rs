@@ -9,7 +9,7 @@ mod params;
 
 pub use error::{Mismatch, WeightError};
 pub use file::{WeightFile, write_safetensors};
-pub use params::{fill_params, load_strict, named_params, param_shapes};
+pub use params::{fill_params, fill_some_params, load_strict, named_params, param_shapes};
 
 /// A tensor on the host, row-major.
 #[derive(Debug, Clone, PartialEq)]

@@ -33,7 +33,18 @@ pub fn param_shapes<M: Module>(module: &M) -> Vec<(String, Vec<usize>)> {
 /// The first error of `values`, or [`WeightError::Count`] when it returns another number of values.
 pub fn fill_params<M: Module>(
     module: M,
-    values: impl FnMut(&str, &[usize]) -> Result<Vec<f32>, WeightError>,
+    mut values: impl FnMut(&str, &[usize]) -> Result<Vec<f32>, WeightError>,
+) -> Result<M, WeightError> {
+    fill_some_params(module, |name, shape| values(name, shape).map(Some))
+}
+
+/// As [`fill_params`], but parameters for which `values` returns nothing keep what they have.
+///
+/// # Errors
+/// As [`fill_params`].
+pub fn fill_some_params<M: Module>(
+    module: M,
+    values: impl FnMut(&str, &[usize]) -> Result<Option<Vec<f32>>, WeightError>,
 ) -> Result<M, WeightError> {
     let mut filler = Filler { path: Path::default(), values, error: None };
     let module = module.map(&mut filler);
@@ -127,25 +138,34 @@ struct Filler<F> {
     error: Option<WeightError>,
 }
 
-impl<F: FnMut(&str, &[usize]) -> Result<Vec<f32>, WeightError>> Filler<F> {
-    fn checked_values(&mut self, shape: &[usize]) -> Result<Vec<f32>, WeightError> {
+impl<F: FnMut(&str, &[usize]) -> Result<Option<Vec<f32>>, WeightError>> Filler<F> {
+    fn checked_values(&mut self, shape: &[usize]) -> Result<Option<Vec<f32>>, WeightError> {
         let name = self.path.joined();
         let values = (self.values)(&name, shape)?;
-        if values.len() != shape.iter().product::<usize>() {
-            return Err(WeightError::Count { name, shape: shape.to_vec(), found: values.len() });
+        match &values {
+            Some(values) if values.len() != shape.iter().product::<usize>() => {
+                Err(WeightError::Count { name, shape: shape.to_vec(), found: values.len() })
+            }
+            _ => Ok(values),
         }
-        Ok(values)
     }
 }
 
-impl<F: FnMut(&str, &[usize]) -> Result<Vec<f32>, WeightError>> ModuleMapper for Filler<F> {
+impl<F: FnMut(&str, &[usize]) -> Result<Option<Vec<f32>>, WeightError>> ModuleMapper for Filler<F> {
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
         if self.error.is_some() {
             return param;
         }
         let shape = param.lazy_shape().as_slice().to_vec();
         match self.checked_values(&shape) {
-            Ok(values) => param.map(|old| {
+            Ok(None) => param,
+            // A parameter that was never used is replaced without drawing its first values.
+            Ok(Some(values)) if !param.is_initialized() => {
+                let new = Tensor::from_data(TensorData::new(values, shape), &param.lazy_device());
+                let id = param.id;
+                param.transform_for_load(new, id)
+            }
+            Ok(Some(values)) => param.map(|old| {
                 let new = Tensor::from_data(TensorData::new(values, shape), &old.device());
                 if old.is_require_grad() { new.require_grad() } else { new }
             }),
@@ -249,6 +269,15 @@ mod tests {
                 "in: dir/w.safetensors",
             ]
         );
+    }
+
+    #[test]
+    fn parameters_without_new_values_keep_theirs() {
+        let before = tree(&Device::flex());
+        let rule = |name: &str, _: &[usize]| Ok((name == "leaves.0.bias").then(|| vec![5.0; 2]));
+        let after = named_params(&fill_some_params(before, rule).unwrap()).unwrap();
+        let values: Vec<f32> = after.iter().map(|(_, tensor)| tensor.data[0]).collect();
+        assert_eq!(values, [0.0, 5.0, 0.0, 1.0]);
     }
 
     #[test]

@@ -1,0 +1,3 @@
+//! Integration tests of the latent diffusion networks.
+
+mod text;
