@@ -2,7 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use clap::Parser;
 use rigscape::bev_vae::Experiment;
+use rigscape::commands::{CheckDataArgs, Chosen};
 use rigscape::config_file;
 
 fn files(folder: &Path, found: &mut Vec<PathBuf>) {
@@ -20,7 +22,7 @@ fn files(folder: &Path, found: &mut Vec<PathBuf>) {
 fn shipped_configs_are_read_strictly_and_stay_short() {
     let mut found = Vec::new();
     files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &mut found);
-    assert!(found.len() >= 3, "{found:?}");
+    assert!(found.len() >= 7, "{found:?}");
     for path in found {
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.starts_with('#'), "{}: open with what to expect", path.display());
@@ -29,9 +31,39 @@ fn shipped_configs_are_read_strictly_and_stay_short() {
             "{}: differences only",
             path.display()
         );
+        if path.parent().is_some_and(|folder| folder.ends_with("configs/data")) {
+            let chosen = read_as_data(&path).unwrap_or_else(|error| panic!("{error:#}"));
+            assert!(!chosen.datasets.is_empty() && chosen.loader.is_none(), "{}: only datasets", path.display());
+            continue;
+        }
         let experiment: Experiment = config_file::load(&path, &[]).unwrap_or_else(|error| panic!("{error:#}"));
         // What a run writes into its folder must read back as the same experiment.
         let again: Experiment = config_file::parse(&toml::to_string(&experiment).unwrap(), &[]).unwrap();
         assert_eq!(experiment, again, "{}", path.display());
     }
+}
+
+/// As `check-data --config` and `show-data --config` read a file.
+fn read_as_data(path: &Path) -> anyhow::Result<Chosen> {
+    CheckDataArgs::try_parse_from(["check-data".as_ref(), "--config".as_ref(), path.as_os_str()])?.source.choose()
+}
+
+#[test]
+fn examples_on_the_data_pages_are_read_strictly() {
+    // Datasets may lie in the folder too: only its own pages.
+    let entries = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("data")).unwrap();
+    let pages: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let mut read = 0;
+    for page in pages.iter().filter(|path| path.extension().is_some_and(|e| e == "md")) {
+        let text = std::fs::read_to_string(page).unwrap();
+        for example in text.split("```toml\n").skip(1).filter_map(|rest| rest.split("```").next()) {
+            let path = folder.path().join("example.toml");
+            std::fs::write(&path, example).unwrap();
+            let chosen = read_as_data(&path).unwrap_or_else(|error| panic!("{}: {error:#}", page.display()));
+            assert_eq!(chosen.datasets.len(), 1, "{}", page.display());
+            read += 1;
+        }
+    }
+    assert_eq!(read, 7, "one example on each page");
 }

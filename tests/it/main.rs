@@ -2,5 +2,6 @@
 
 mod architecture;
 mod configs;
+mod data_commands;
 mod programs;
 mod runs;

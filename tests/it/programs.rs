@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 use crate::runs::{must, train, write_config};
 
-fn rigscape(args: &[&str]) -> Output {
+pub fn rigscape(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_rigscape")).args(args).output().unwrap()
 }
 
@@ -18,7 +18,7 @@ fn refusal(output: Output) -> String {
 }
 
 /// Real fixtures, when there are any.
-fn data(part: &str) -> Option<PathBuf> {
+pub fn data(part: &str) -> Option<PathBuf> {
     let Some(root) = std::env::var_os("RIGSCAPE_DATA") else {
         eprintln!("did not run: set RIGSCAPE_DATA for the checks on real data");
         return None;
@@ -80,7 +80,7 @@ fn made_data_is_checked_trained_on_and_looked_at() {
     assert!(info.contains("step 2"), "{info}");
 
     // A picture cut in half stops the check and the run, by name.
-    let victim = first_jpg(&out.join("samples"));
+    let victim = files_below(&out.join("samples"), "jpg").swap_remove(0);
     let bytes = std::fs::read(&victim).unwrap();
     std::fs::write(&victim, &bytes[..bytes.len() / 2]).unwrap();
     let name = victim.file_name().unwrap().to_string_lossy().into_owned();
@@ -91,14 +91,19 @@ fn made_data_is_checked_trained_on_and_looked_at() {
     assert!(stopped.contains(&name), "{stopped}");
 }
 
-fn first_jpg(folder: &Path) -> PathBuf {
-    let mut entries: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-    entries.sort();
-    let mut inside = entries.iter().filter(|path| path.is_dir()).filter_map(|path| {
-        let found = std::fs::read_dir(path).ok()?.filter_map(|entry| Some(entry.ok()?.path()));
-        found.filter(|file| file.extension().is_some_and(|e| e == "jpg")).min()
-    });
-    inside.next().expect("a picture")
+/// All files of this kind below a folder, by path.
+pub fn files_below(folder: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files_below(&path, extension));
+        } else if path.extension().is_some_and(|e| e == extension) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
 }
 
 #[test]

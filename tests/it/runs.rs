@@ -145,6 +145,16 @@ fn a_stopped_and_resumed_run_equals_an_unbroken_one_bit_for_bit() {
 }
 
 #[test]
+fn micro_batches_side_by_side_give_the_same_bits_on_any_number_of_threads() {
+    let (one, three) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for (folder, threads) in [(&one, "1"), (&three, "3")] {
+        let mut command = command(&write_config(folder.path()), &["--set", "train.accumulate=3"]);
+        must(command.env("RAYON_NUM_THREADS", threads).output().unwrap());
+    }
+    assert_equal_checkpoints(one.path(), three.path());
+}
+
+#[test]
 fn a_killed_run_goes_on_from_its_last_whole_checkpoint() {
     let (whole, killed) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     must(train(&write_config(whole.path()), &[]));

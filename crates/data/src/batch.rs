@@ -50,6 +50,9 @@ pub struct ViewArrays {
     pub images: Vec<f32>,
     /// `[B, V]`, true where a view counts.
     pub mask: Vec<bool>,
+    /// `[B, V, H, W]`, true where a pixel counts: false in views that do not, and where the dataset says to ignore it (blurred faces,
+    /// the own car). What a loss or metric compares must be chosen by it.
+    pub pixel_mask: Vec<bool>,
     /// `[B, V, 3, 3]` camera matrix of the raw picture, px.
     pub k: Vec<f32>,
     /// `[B, V, 4, 4]` pose, metres.
@@ -78,6 +81,7 @@ impl ViewArrays {
             width,
             images: vec![0.0; count * 3 * height * width],
             mask: vec![false; count],
+            pixel_mask: vec![false; count * height * width],
             k: identity(3),
             ego_from_cam: identity(4),
             img_from_raw: identity(3),
@@ -101,6 +105,21 @@ impl ViewArrays {
             })
             .collect();
         Self::gather(samples.iter().map(Vec::as_slice), size, pad)
+    }
+
+    /// Pixels of one view that count, `[H, W]`; `at` is sample · V + view.
+    ///
+    /// # Panics
+    /// When there is no such view.
+    pub fn counted_pixels(&self, at: usize) -> &[bool] {
+        let plane = self.height * self.width;
+        &self.pixel_mask[at * plane..][..plane]
+    }
+
+    /// Whether a view that counts has pixels that do not.
+    pub fn has_ignored_pixels(&self) -> bool {
+        let views = self.mask.iter().enumerate().filter(|(_, present)| **present);
+        views.into_iter().any(|(at, _)| self.counted_pixels(at).contains(&false))
     }
 
     fn gather<'a>(
@@ -136,6 +155,12 @@ impl ViewArrays {
         }
         self.mask[at] = true;
         self.images[at * image.len()..][..image.len()].copy_from_slice(image);
+        let plane = self.height * self.width;
+        let pixels = &mut self.pixel_mask[at * plane..][..plane];
+        match &view.pixel_mask {
+            Some(mask) => pixels.copy_from_slice(mask),
+            None => pixels.fill(true),
+        }
         write(&mut self.k, at, &view.k.transpose().to_cols_array_2d());
         write(&mut self.ego_from_cam, at, &view.ego_from_cam.to_rows());
         write(&mut self.img_from_raw, at, &view.edit.to_rows());

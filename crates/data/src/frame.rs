@@ -120,13 +120,22 @@ pub struct ObjectBox {
     pub interpolated: bool,
 }
 
-/// Frames of one scene with the same rig, ascending in time.
-#[derive(Debug, Clone)]
-pub struct Clip {
-    /// The frames.
-    pub frames: Vec<SceneFrame>,
-    /// Nominal rate, Hz.
-    pub rate_hz: f64,
+/// What is known of a frame without making it: enough to index clips and batches.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FrameOutline {
+    /// Reference instant.
+    pub timestamp_ns: i64,
+    /// The static part of the views, in order.
+    pub rig: CameraRig,
+    /// Whether the frame has a list of boxes, be it empty.
+    pub annotated: bool,
+}
+
+impl FrameOutline {
+    /// Of a frame that exists already.
+    pub fn of(frame: &SceneFrame) -> Self {
+        Self { timestamp_ns: frame.timestamp_ns, rig: frame.rig(), annotated: frame.boxes.is_some() }
+    }
 }
 
 /// What a map element means.
@@ -209,7 +218,7 @@ pub struct OccupancyGrid {
 }
 
 /// Optional parts a dataset can deliver. Asking for an absent one is [`DataError::Unsupported`], not an empty answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Capabilities {
     /// Annotated boxes.
     pub boxes: bool,
@@ -241,6 +250,23 @@ pub trait SceneDataset: Send + Sync {
     /// Whatever is wrong with the frame's rows; never a substituted frame.
     fn frame(&self, index: usize) -> Result<SceneFrame, DataError>;
 
+    /// The outline of a frame, equal to [`FrameOutline::of`] it. Readers that know it without making boxes override this: indexing asks
+    /// for every frame.
+    ///
+    /// # Errors
+    /// As [`SceneDataset::frame`].
+    fn outline(&self, index: usize) -> Result<FrameOutline, DataError> {
+        Ok(FrameOutline::of(&self.frame(index)?))
+    }
+
+    /// The classes of a frame's boxes, in any order and as often as they occur; none for a frame that is not annotated.
+    ///
+    /// # Errors
+    /// As [`SceneDataset::frame`].
+    fn box_classes(&self, index: usize) -> Result<Vec<ObjectClass>, DataError> {
+        Ok(self.frame(index)?.boxes.into_iter().flatten().map(|found| found.class).collect())
+    }
+
     /// Frame ranges of the scenes, in order; together all frames. Within a scene time ascends.
     fn scene_ranges(&self) -> Vec<Range<usize>>;
 
@@ -264,6 +290,11 @@ pub trait SceneDataset: Send + Sync {
 
     /// The name it was opened under.
     fn name(&self) -> &str;
+
+    /// What a check should tell beside what the frames show: parts that were asked for and gave no frame, for example.
+    fn notes(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     /// The error for a part this dataset lacks.
     fn unsupported(&self, what: &'static str) -> DataError {

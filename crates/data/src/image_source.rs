@@ -8,7 +8,7 @@ use image::RgbImage;
 
 use crate::resample::resample;
 use crate::store::StoredFile;
-use crate::{DataError, jpeg};
+use crate::{DataError, EmbeddedPicture, jpeg};
 
 /// Where the pixels of a view are.
 #[derive(Debug, Clone)]
@@ -18,6 +18,13 @@ pub enum ImageSource {
         /// The file, checked to lie inside the dataset's root.
         file: StoredFile,
         /// Width and height the tables announce.
+        size: (u32, u32),
+    },
+    /// An encoded picture inside a larger file, such as a record or a table.
+    Embedded {
+        /// Where it is; holds no bytes.
+        picture: EmbeddedPicture,
+        /// Width and height the calibration announces.
         size: (u32, u32),
     },
     /// A camera in the procedural world; rendered exactly at the asked size.
@@ -42,7 +49,7 @@ impl ImageSource {
     /// that is not made of scale, shift and mirror.
     pub fn load(&self, edit: &ImageEdit) -> Result<RgbImage, DataError> {
         match self {
-            Self::File { file, size } => resample(&decode_file(file, *size)?, edit),
+            Self::File { .. } | Self::Embedded { .. } => resample(&self.decode()?, edit),
             Self::Rendered { snapshot, camera, world_from_cam } => render(snapshot, camera, world_from_cam, edit),
         }
     }
@@ -53,7 +60,8 @@ impl ImageSource {
     /// As [`ImageSource::load`].
     pub fn decode(&self) -> Result<RgbImage, DataError> {
         match self {
-            Self::File { file, size } => decode_file(file, *size),
+            Self::File { file, size } => decode_bytes(&file.bytes()?, *size, file.path()),
+            Self::Embedded { picture, size } => decode_bytes(&picture.bytes()?, *size, picture.path()),
             Self::Rendered { snapshot, camera, world_from_cam } => {
                 let edit = ImageEdit::identity(camera.intrinsics.width, camera.intrinsics.height);
                 render(snapshot, camera, world_from_cam, &edit)
@@ -68,8 +76,20 @@ impl ImageSource {
     pub fn inspect(&self) -> Result<(), DataError> {
         match self {
             Self::File { file, size } => inspect_file(file, *size),
+            Self::Embedded { picture, size } => inspect_bytes(&picture.bytes()?, *size, picture.path()),
             Self::Rendered { .. } => Ok(()),
         }
+    }
+
+    /// The bytes of a JPEG as they are stored, [inspected](ImageSource::inspect); `None` for other formats and rendered sources.
+    pub(crate) fn jpeg_bytes(&self) -> Result<Option<Vec<u8>>, DataError> {
+        let (bytes, size, path) = match self {
+            Self::File { file, size } => (file.bytes()?, size, file.path()),
+            Self::Embedded { picture, size } => (picture.bytes()?, size, picture.path()),
+            Self::Rendered { .. } => return Ok(None),
+        };
+        inspect_bytes(&bytes, *size, path)?;
+        Ok(jpeg::is_jpeg(&bytes).then_some(bytes))
     }
 }
 
@@ -89,9 +109,8 @@ fn render(
 }
 
 /// All pixels of a picture whose size is known from its table; checked against the file's header before a pixel buffer is reserved.
-fn decode_file(file: &StoredFile, size: (u32, u32)) -> Result<RgbImage, DataError> {
-    let (bytes, path) = (file.bytes()?, file.path());
-    if jpeg::is_jpeg(&bytes) { jpeg::decode(&bytes, size, path) } else { decode_other(&bytes, size, path) }
+fn decode_bytes(bytes: &[u8], size: (u32, u32), path: &Path) -> Result<RgbImage, DataError> {
+    if jpeg::is_jpeg(bytes) { jpeg::decode(bytes, size, path) } else { decode_other(bytes, size, path) }
 }
 
 /// PNG, the other format that datasets and writers use.
@@ -111,11 +130,20 @@ fn decode_other(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbImage,
 
 fn inspect_file(file: &StoredFile, size: (u32, u32)) -> Result<(), DataError> {
     let (head, tail) = file.ends(64 * 1024)?;
-    match jpeg::outline(&head, true) {
-        Ok(outline) if outline.size == size && tail == [0xFF, 0xD9] => Ok(()),
-        // Long application segments, trailing bytes, other formats and every real fault: decode and say it exactly.
-        _ => decode_file(file, size).map(|_| ()),
+    if looks_whole(&head, tail, size) {
+        return Ok(());
     }
+    // Long application segments, trailing bytes, other formats and every real fault: decode and say it exactly.
+    decode_bytes(&file.bytes()?, size, file.path()).map(drop)
+}
+
+fn inspect_bytes(bytes: &[u8], size: (u32, u32), path: &Path) -> Result<(), DataError> {
+    let tail = bytes.last_chunk().copied().unwrap_or_default();
+    if looks_whole(bytes, tail, size) { Ok(()) } else { decode_bytes(bytes, size, path).map(drop) }
+}
+
+fn looks_whole(head: &[u8], tail: [u8; 2], size: (u32, u32)) -> bool {
+    tail == [0xFF, 0xD9] && jpeg::outline(head, true).is_ok_and(|outline| outline.size == size)
 }
 
 #[cfg(test)]

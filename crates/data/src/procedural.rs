@@ -17,8 +17,8 @@ use crate::occupancy::OCC3D_GRID;
 use crate::procedural_cache::SceneCache;
 use crate::seeding::{Purpose, rng};
 use crate::{
-    Capabilities, DataError, FrameId, ImageSource, LocalMap, MapKind, ObjectBox, ObjectClass, OccupancyGrid,
-    OccupancyLabels, SceneDataset, SceneFrame, View,
+    Capabilities, DataError, FrameId, FrameOutline, ImageSource, LocalMap, MapKind, ObjectBox, ObjectClass,
+    OccupancyGrid, OccupancyLabels, SceneDataset, SceneFrame, View,
 };
 
 /// Time stamp of the first scene's beginning; an arbitrary instant of 2020.
@@ -37,6 +37,8 @@ pub enum RigSource {
     Preset(RigPreset),
     /// A JSON file holding a [`CameraRig`].
     File(PathBuf),
+    /// The cameras themselves.
+    Cameras(CameraRig),
 }
 
 /// Settings of a [`Procedural`] dataset.
@@ -121,6 +123,7 @@ impl Procedural {
         let mut rig = match &config.rig {
             RigSource::Preset(preset) => preset.rig(),
             RigSource::File(path) => read_rig(path)?,
+            RigSource::Cameras(rig) => rig.clone(),
         };
         if let Some(unknown) = config.cameras.iter().find(|name| rig.cameras.iter().all(|c| c.channel != **name)) {
             let known: Vec<&str> = rig.cameras.iter().map(|c| c.channel.as_str()).collect();
@@ -154,12 +157,22 @@ impl Procedural {
 
     /// Scene, time and world of a frame.
     fn moment(&self, index: usize) -> Result<(usize, f64, Arc<World>), DataError> {
-        if index >= self.len() {
-            let (name, len) = (&self.config.name, self.len());
-            return Err(DataError::Config(format!("dataset {name} has {len} frames; there is no frame {index}")));
-        }
+        self.check_index(index)?;
         let (scene, time_secs) = self.instant(index);
         Ok((scene, time_secs, self.world(scene)))
+    }
+
+    fn check_index(&self, index: usize) -> Result<(), DataError> {
+        if index < self.len() {
+            return Ok(());
+        }
+        let (name, len) = (&self.config.name, self.len());
+        Err(DataError::Config(format!("dataset {name} has {len} frames; there is no frame {index}")))
+    }
+
+    fn timestamp_ns(&self, index: usize) -> i64 {
+        let (scene, time_secs) = self.instant(index);
+        EPOCH_NS + scene as i64 * SCENE_SPACING_NS + (time_secs * 1e9).round() as i64
     }
 
     fn frame_rig(&self, index: usize) -> CameraRig {
@@ -177,7 +190,7 @@ impl SceneDataset for Procedural {
     fn frame(&self, index: usize) -> Result<SceneFrame, DataError> {
         let (scene, time_secs, world) = self.moment(index)?;
         let world_from_ego = world.world_from_ego(time_secs);
-        let timestamp_ns = EPOCH_NS + scene as i64 * SCENE_SPACING_NS + (time_secs * 1e9).round() as i64;
+        let timestamp_ns = self.timestamp_ns(index);
         let snapshot = Arc::new(world.snapshot(time_secs));
         let view = |mounted: geometry::RigCamera| {
             let camera = mounted.camera().map_err(|e| {
@@ -208,6 +221,17 @@ impl SceneDataset for Procedural {
             boxes: Some(world.actors_at(time_secs).iter().map(|actor| object_box(actor, &ego_from_world)).collect()),
             scene_text: Some(world.caption()),
         })
+    }
+
+    fn outline(&self, index: usize) -> Result<FrameOutline, DataError> {
+        self.check_index(index)?;
+        Ok(FrameOutline { timestamp_ns: self.timestamp_ns(index), rig: self.frame_rig(index), annotated: true })
+    }
+
+    fn box_classes(&self, index: usize) -> Result<Vec<ObjectClass>, DataError> {
+        self.check_index(index)?;
+        let (scene, time_secs) = self.instant(index);
+        Ok(self.world(scene).actors_at(time_secs).iter().map(shared_class).collect())
     }
 
     fn scene_ranges(&self) -> Vec<Range<usize>> {
@@ -264,13 +288,17 @@ impl SceneDataset for Procedural {
     }
 }
 
+/// Both lists begin with the ten nuScenes detection classes, in the same order.
+fn shared_class(actor: &ActorState) -> ObjectClass {
+    ObjectClass::ALL[actor.class.index()]
+}
+
 fn object_box(actor: &ActorState, ego_from_world: &Rigid) -> ObjectBox {
     let velocity = ego_from_world.transform_vector(DVec3::new(actor.velocity.x, actor.velocity.y, 0.0));
     let attributes = [(actor.parked, "parked"), (actor.with_rider, "with_rider")];
     ObjectBox {
         box3d: actor.world_box.transformed(ego_from_world),
-        // Both lists begin with the ten nuScenes detection classes, in the same order.
-        class: ObjectClass::ALL[actor.class.index()],
+        class: shared_class(actor),
         track: actor.id.to_string(),
         source_class: actor.class.name().into(),
         velocity: Some([velocity.x, velocity.y]),

@@ -4,9 +4,12 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
+use crate::argoverse2::{Argoverse2, Argoverse2Config};
 use crate::nuplan::{NuPlan, NuPlanConfig};
 use crate::nuscenes::{NuScenes, NuScenesConfig};
 use crate::procedural::{Procedural, ProceduralConfig};
+use crate::waymo::{Waymo, WaymoConfig};
+use crate::wayvescenes::{WayveScenes, WayveScenesConfig};
 use crate::{DataError, SceneDataset};
 
 /// Makes the serde enum and the arm that opens each kind: a new dataset is one line.
@@ -38,4 +41,10 @@ datasets! {
     "nuscenes" => NuScenes(NuScenesConfig),
     /// nuPlan logs with pictures.
     "nuplan" => NuPlan(NuPlanConfig),
+    /// WayveScenes101, also what our own writer makes.
+    "wayve_scenes101" => WayveScenes(WayveScenesConfig),
+    /// Waymo Open Dataset, perception: either release.
+    "waymo" => Waymo(WaymoConfig),
+    /// The Argoverse 2 sensor dataset, also that of our own writer.
+    "argoverse2" => Argoverse2(Argoverse2Config),
 }

@@ -7,7 +7,7 @@ use geometry::{CameraRig, ImageEdit, RigCamera, Rigid};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-use crate::undistort::load_pinhole;
+use crate::undistort::{load_pinhole, load_pinhole_mask};
 use crate::{DataError, FrameId, ImageSource, SceneFrame, View};
 
 /// Network picture size; a raw picture is stretched to it, aspect ratio not kept.
@@ -69,6 +69,8 @@ pub struct SampleView {
     pub channel: String,
     /// RGB in [0, 1], `[3, H, W]`; `None` masks the view out.
     pub image: Option<Arc<Vec<f32>>>,
+    /// `[H, W]`, false where the dataset says to ignore the pixel; `None` where every pixel counts.
+    pub pixel_mask: Option<Arc<Vec<bool>>>,
     /// Camera matrix of the raw picture, px.
     pub k: DMat3,
     /// Pose, metres.
@@ -124,6 +126,8 @@ impl SampleView {
         }
         if let Some(source) = &view.image {
             loaded.image = Some(Arc::new(planar(&load_pinhole(source, view, &loaded.edit)?)));
+            let mask = view.mask.as_ref().map(|mask| load_pinhole_mask(mask, view, &loaded.edit));
+            loaded.pixel_mask = mask.transpose()?.map(Arc::new);
         }
         Ok(loaded)
     }
@@ -134,16 +138,20 @@ impl SampleView {
         Self {
             channel: camera.channel.clone(),
             image: None,
+            pixel_mask: None,
             k: raw.matrix(),
             ego_from_cam: camera.ego_from_cam,
             edit: ImageEdit::identity(raw.width, raw.height).resize(size.width, size.height),
         }
     }
 
-    /// Mirrors pixels and matrix.
+    /// Mirrors pixels, their mask and the matrix.
     pub fn flip(&mut self) {
         let width = self.edit.width as usize;
         self.edit_pixels(|pixels| pixels.chunks_exact_mut(width).for_each(<[f32]>::reverse));
+        if let Some(mask) = &mut self.pixel_mask {
+            Arc::make_mut(mask).chunks_exact_mut(width).for_each(<[bool]>::reverse);
+        }
         self.edit = self.edit.flip();
     }
 

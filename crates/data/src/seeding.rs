@@ -17,6 +17,12 @@ pub(crate) enum Purpose {
     Scene = 4,
     /// Settings of one procedural frame; `a` = frame.
     Frame = 5,
+    /// Order of datasets among the frames with one number of views; `a` = epoch, `b` = number of views.
+    BucketOrder = 6,
+    /// Where the draws of a class-balanced pass begin; `a` = dataset.
+    DrawOffset = 7,
+    /// Pictures of one scene that a check decodes; `a` = scene.
+    Check = 20,
 }
 
 /// The generator for one purpose.

@@ -1,22 +1,33 @@
-//! A dataset's root, read-only. Readers name files by relative paths and never learn what lies under the root.
+//! A dataset's root, read-only. Readers name files by relative paths and never learn what lies under the root: a folder, a zip or tar
+//! archive, or several of them laid over one another.
 
-use std::fmt;
-use std::io::{ErrorKind, Read, Seek, SeekFrom};
+mod archive;
+mod convert;
+mod file;
+mod index;
+mod index_cache;
+mod mount;
+mod positional;
+mod roots;
+mod tar;
+mod zip;
+
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
+pub use convert::index_archive;
+pub use file::StoredFile;
+pub use roots::{Root, Roots};
+
+use file::{Place, missing};
+use mount::Mount;
+
 use crate::DataError;
 
-/// The root of a dataset. Cheap to clone.
+/// The root of a dataset: folders and archives, searched in order. Cheap to clone.
 #[derive(Debug, Clone)]
 pub struct Store {
-    folder: Arc<Path>,
-}
-
-/// A file below a [`Store`]; holds no bytes and no open handle. Ordered and compared by its name.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct StoredFile {
-    path: PathBuf,
+    mounts: Arc<[Mount]>,
 }
 
 /// A direct child of a folder below a [`Store`].
@@ -29,27 +40,36 @@ pub struct StoredName {
 }
 
 impl Store {
-    /// Opens a root.
+    /// Opens one root: a folder, a zip archive or an uncompressed tar archive.
     ///
     /// # Errors
-    /// [`DataError::Missing`] where there is none.
+    /// As [`Store::open_all`].
     pub fn open(root: impl AsRef<Path>) -> Result<Self, DataError> {
-        let root = root.as_ref();
-        if root.is_dir() {
-            return Ok(Self { folder: root.into() });
-        }
-        Err(DataError::Missing { what: "dataset folder".to_owned(), path: root.to_owned() })
+        Self::open_all(&Roots::from(root.as_ref()))
     }
 
-    /// Where a name would lie, for messages only.
+    /// Opens several roots that are laid over one another: of two files with one name, that of the earlier root is read.
+    ///
+    /// # Errors
+    /// [`DataError::Missing`] where there is none; [`DataError::Config`] for an empty list; for archives [`DataError::Format`] (damage,
+    /// gzip, encryption, links, unknown methods, names that occur twice), [`DataError::UnsafePath`], [`DataError::Truncated`] and
+    /// [`DataError::Empty`]. An archive with one entry that is refused is refused as a whole.
+    pub fn open_all(roots: &Roots) -> Result<Self, DataError> {
+        if roots.as_slice().is_empty() {
+            return Err(DataError::Config("`root` is an empty list".to_owned()));
+        }
+        let mounts: Result<Vec<Mount>, DataError> = roots.as_slice().iter().map(Mount::open).collect();
+        Ok(Self { mounts: mounts?.into() })
+    }
+
+    /// Where a name would lie, for messages only: in the first root.
     pub fn path(&self, name: &str) -> PathBuf {
-        self.folder.join(name)
+        self.mounts.first().map(|mount| mount.path(name)).unwrap_or_default()
     }
 
     /// A file, if it exists.
     pub fn find(&self, name: &str) -> Option<StoredFile> {
-        let path = self.folder.join(name);
-        path.is_file().then_some(StoredFile { path })
+        self.mounts.iter().find_map(|mount| mount.find(name))
     }
 
     /// A file that must exist.
@@ -57,18 +77,23 @@ impl Store {
     /// # Errors
     /// [`DataError::Missing`], naming it and what it is for.
     pub fn file(&self, name: &str, what: &str) -> Result<StoredFile, DataError> {
-        self.find(name).ok_or_else(|| DataError::Missing { what: what.to_owned(), path: self.path(name) })
+        self.find(name).ok_or_else(|| missing(what, self.mounts.len(), self.path(name)))
     }
 
     /// A file that is expected, not looked for: pictures, whose absence shows when they are read.
     pub fn expected(&self, name: &str) -> StoredFile {
-        StoredFile { path: self.folder.join(name) }
+        // A lone folder is not asked: that would be one system call per picture of every frame.
+        if let [Mount::Folder(folder)] = &*self.mounts {
+            return StoredFile { path: folder.join(name), place: Place::Disk };
+        }
+        let nowhere = || StoredFile { path: self.path(name), place: Place::Nowhere(self.mounts.len()) };
+        self.find(name).unwrap_or_else(nowhere)
     }
 
     /// All bytes of a file that must exist.
     ///
     /// # Errors
-    /// [`DataError::Missing`] or [`DataError::Io`].
+    /// [`DataError::Missing`] or as [`StoredFile::bytes`].
     pub fn read(&self, name: &str, what: &str) -> Result<Vec<u8>, DataError> {
         self.file(name, what)?.bytes()
     }
@@ -78,20 +103,13 @@ impl Store {
     /// # Errors
     /// [`DataError::Io`].
     pub fn list(&self, folder: &str) -> Result<Vec<StoredName>, DataError> {
-        let path = self.folder.join(folder);
-        if !path.is_dir() {
-            return Ok(Vec::new());
-        }
-        let io = |source| DataError::Io { action: "list", source, path: path.clone() };
         let mut names = Vec::new();
-        for entry in std::fs::read_dir(&path).map_err(io)? {
-            let entry = entry.map_err(io)?;
-            // Names that are no text cannot be named by any table.
-            if let Ok(name) = entry.file_name().into_string() {
-                names.push(StoredName { name, is_folder: entry.path().is_dir() });
-            }
+        for mount in &*self.mounts {
+            names.append(&mut mount.list(folder)?);
         }
-        names.sort();
+        // Stable: of two with one name, that of the earlier root stays.
+        names.sort_by(|a, b| a.name.cmp(&b.name));
+        names.dedup_by(|later, earlier| later.name == earlier.name);
         Ok(names)
     }
 }
@@ -105,63 +123,6 @@ pub fn checked_name<'a>(text: &'a str, found_in: &Path) -> Result<&'a str, DataE
         && !text.contains(['\\', '\0', ':'])
         && Path::new(text).components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if plain { Ok(text) } else { Err(DataError::UnsafePath { text: text.to_owned(), path: found_in.to_owned() }) }
-}
-
-impl StoredFile {
-    /// Its path, for messages only.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Its path when it is an ordinary file, for libraries that open files themselves (SQLite, memory maps).
-    pub fn on_disk(&self) -> Option<&Path> {
-        Some(&self.path)
-    }
-
-    /// All bytes.
-    ///
-    /// # Errors
-    /// [`DataError::Missing`] or [`DataError::Io`].
-    pub fn bytes(&self) -> Result<Vec<u8>, DataError> {
-        std::fs::read(&self.path).map_err(|source| self.failure("read", source))
-    }
-
-    /// The first bytes, at most `head`, and the last two, for a look at a picture without reading it.
-    ///
-    /// # Errors
-    /// As [`StoredFile::bytes`].
-    pub fn ends(&self, head: usize) -> Result<(Vec<u8>, [u8; 2]), DataError> {
-        let io = |source| DataError::Io { action: "read", source, path: self.path.clone() };
-        let mut file = std::fs::File::open(&self.path).map_err(|source| self.failure("open", source))?;
-        let mut first = Vec::new();
-        file.by_ref().take(head as u64).read_to_end(&mut first).map_err(io)?;
-        let mut tail = [0u8; 2];
-        if file.seek(SeekFrom::End(0)).map_err(io)? >= 2 {
-            file.seek(SeekFrom::End(-2)).map_err(io)?;
-            file.read_exact(&mut tail).map_err(io)?;
-        }
-        Ok((first, tail))
-    }
-
-    fn failure(&self, action: &'static str, source: std::io::Error) -> DataError {
-        let path = self.path.clone();
-        match source.kind() {
-            ErrorKind::NotFound | ErrorKind::NotADirectory => DataError::Missing { what: "file".to_owned(), path },
-            _ => DataError::Io { action, source, path },
-        }
-    }
-}
-
-impl From<PathBuf> for StoredFile {
-    fn from(path: PathBuf) -> Self {
-        Self { path }
-    }
-}
-
-impl fmt::Display for StoredFile {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.path.display().fmt(f)
-    }
 }
 
 #[cfg(test)]
@@ -191,6 +152,11 @@ mod tests {
         let names: Vec<_> = store.list("").unwrap().into_iter().map(|n| (n.name, n.is_folder)).collect();
         assert_eq!(names, [("a".into(), false), ("b".into(), false), ("c".into(), true)]);
         assert_eq!(store.read("c/d", "d").unwrap(), b"c/d");
+        let file = store.file("c/d", "d").unwrap();
+        assert_eq!((file.size().unwrap(), file.read_at(1, 2).unwrap()), (3, b"/d".to_vec()));
+        for (offset, length) in [(2, 2), (4, 0), (u64::MAX, 2), (0, u64::MAX)] {
+            assert!(matches!(file.read_at(offset, length), Err(DataError::Truncated { offset: 3, .. })));
+        }
         assert!(store.list("x").unwrap().is_empty());
         let error = store.file("c/e", "calibration").unwrap_err().to_string();
         assert!(error.starts_with("missing calibration") && error.ends_with("c/e"), "{error}");

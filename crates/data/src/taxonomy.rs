@@ -99,7 +99,8 @@ pub fn from_argoverse2(category: &str) -> Option<ObjectClass> {
         "BICYCLE" => Bicycle,
         "PEDESTRIAN" | "OFFICIAL_SIGNALER" | "BICYCLIST" | "MOTORCYCLIST" | "WHEELED_RIDER" => Pedestrian,
         "CONSTRUCTION_CONE" | "CONSTRUCTION_BARREL" => TrafficCone,
-        "SIGN" | "STOP_SIGN" | "MOBILE_PEDESTRIAN_CROSSING_SIGN" => Sign,
+        // The annotation guide and the files name the same sign differently.
+        "SIGN" | "STOP_SIGN" | "MOBILE_PEDESTRIAN_CROSSING_SIGN" | "MOBILE_PEDESTRIAN_SIGN" => Sign,
         "ANIMAL" | "DOG" => Animal,
         "BOLLARD" | "RAILED_VEHICLE" | "STROLLER" | "WHEELCHAIR" | "WHEELED_DEVICE" => Other,
         _ => return None,

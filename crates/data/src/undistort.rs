@@ -4,6 +4,7 @@ use geometry::glam::DVec2;
 use geometry::{Camera, ImageEdit, Intrinsics, Lens};
 use image::{Rgb, RgbImage};
 
+use crate::resample::resample;
 use crate::{DataError, ImageSource, View};
 
 /// Sub-samples per output pixel and axis, so that undistorting does not alias.
@@ -23,14 +24,39 @@ pub(crate) fn load_pinhole(source: &ImageSource, view: &View, edit: &ImageEdit) 
             let (snapshot, world_from_cam) = (snapshot.clone(), *world_from_cam);
             ImageSource::Rendered { snapshot, camera: camera(Lens::Pinhole)?, world_from_cam }.load(edit)
         }
-        ImageSource::File { .. } => {
-            // Shrinking first, by area, to a multiple of the final size: reading single raw pixels would alias.
-            let Intrinsics { width, height, .. } = view.intrinsics;
-            let fine = ImageEdit::identity(width, height)
-                .resize((edit.width * SUBSAMPLES).min(width), (edit.height * SUBSAMPLES).min(height));
+        ImageSource::File { .. } | ImageSource::Embedded { .. } => {
+            let fine = fine_edit(&view.intrinsics, edit);
             Ok(remap(&source.load(&fine)?, &fine, &camera(view.lens)?, edit))
         }
     }
+}
+
+/// Shrinking first, by area, to a multiple of the final size: reading single raw pixels would alias.
+fn fine_edit(raw: &Intrinsics, edit: &ImageEdit) -> ImageEdit {
+    let (width, height) = (raw.width, raw.height);
+    ImageEdit::identity(width, height)
+        .resize((edit.width * SUBSAMPLES).min(width), (edit.height * SUBSAMPLES).min(height))
+}
+
+/// Which pixels of the view's picture under `edit` count: `[H, W]`, true where no raw pixel that the mask ignores, and no direction
+/// that the lens did not see, takes part.
+pub(crate) fn load_pinhole_mask(mask: &ImageSource, view: &View, edit: &ImageEdit) -> Result<Vec<bool>, DataError> {
+    let mut raw = mask.decode()?;
+    raw.pixels_mut().for_each(|pixel| pixel.0 = if keeps(pixel) { [255; 3] } else { [0; 3] });
+    let edited = if view.lens == Lens::Pinhole {
+        resample(&raw, edit)?
+    } else {
+        let camera = Camera::new(view.intrinsics, view.lens)
+            .map_err(|e| DataError::Config(format!("camera {}: {e}", view.channel)))?;
+        let fine = fine_edit(&view.intrinsics, edit);
+        remap(&resample(&raw, &fine)?, &fine, &camera, edit)
+    };
+    Ok(edited.pixels().map(|pixel| pixel.0[0] == u8::MAX).collect())
+}
+
+/// Whether a mask's pixel is nonzero as 8-bit grey, by the luma weights of ITU-R 601 in 16-bit fixed point that Python's tools use.
+pub(crate) fn keeps(Rgb([r, g, b]): &Rgb<u8>) -> bool {
+    19595 * u32::from(*r) + 38470 * u32::from(*g) + 7471 * u32::from(*b) + 0x8000 >= 1 << 16
 }
 
 /// Looks every sub-sample of the pinhole picture up in the distorted one.

@@ -25,6 +25,24 @@ pub enum GeometryError {
         /// Its value.
         value: f64,
     },
+    /// A list of numbers of another length.
+    #[error("{what} holds {got} numbers, not {want}")]
+    Count {
+        /// Which quantity.
+        what: &'static str,
+        /// How many there are.
+        got: usize,
+        /// How many there must be.
+        want: usize,
+    },
+    /// A 4×4 matrix that is not a rotation with a shift.
+    #[error("{what} is not a rotation with a shift: it differs from one by {deviation}")]
+    NotRigid {
+        /// Which matrix.
+        what: &'static str,
+        /// Greatest deviation of RᵀR from the identity, or of the last row from (0, 0, 0, 1); 2 for a mirror image.
+        deviation: f64,
+    },
     /// A pose was asked for outside the covered time, or inside a gap that is too long to interpolate.
     #[error("no pose at {timestamp_ns} ns: {why}")]
     NoPose {

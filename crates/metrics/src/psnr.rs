@@ -59,6 +59,26 @@ impl Psnr {
         db
     }
 
+    /// As [`Psnr::update`] over the pixels that count only. An image without any is left out and gives `None`.
+    ///
+    /// # Shapes
+    /// - prediction, target: `[C, H, W]`
+    /// - counts: `[H, W]`
+    ///
+    /// # Panics
+    /// When the lengths do not fit.
+    pub fn update_where(&mut self, prediction: &[f32], target: &[f32], counts: &[bool]) -> Option<f64> {
+        assert!(target.len().is_multiple_of(counts.len()), "whole planes of {} pixels", counts.len());
+        if counts.iter().all(|counts| *counts) {
+            return Some(self.update(prediction, target));
+        }
+        let chosen = |image: &[f32]| -> Vec<f32> {
+            image.iter().zip(counts.iter().cycle()).filter(|(_, counts)| **counts).map(|(value, _)| *value).collect()
+        };
+        let target = chosen(target);
+        (!target.is_empty()).then(|| self.update(&chosen(prediction), &target))
+    }
+
     /// Adds every image of another collector.
     pub fn merge(&mut self, other: Self) {
         self.values_db.extend(other.values_db);
@@ -93,6 +113,17 @@ mod tests {
         let mut psnr = Psnr::default();
         assert!(psnr.update(&[f32::NAN, 0.0], &[0.5, 0.5]).is_nan());
         assert!(psnr.summary().mean_db.unwrap().is_nan());
+    }
+
+    #[test]
+    fn pixels_that_do_not_count_change_nothing() {
+        let mut psnr = Psnr::default();
+        // Two channels of three pixels; the middle pixel is ignored.
+        let (image, counts) = ([0.5, 9.0, 0.5, 0.5, -9.0, 0.5], [true, false, true]);
+        let db = psnr.update_where(&image, &[0.0; 6], &counts).unwrap();
+        assert!((db - psnr_db(0.25)).abs() < 1e-12);
+        assert_eq!(psnr.update_where(&image, &[0.0; 6], &[false; 3]), None);
+        assert_eq!(psnr.summary().images, 1);
     }
 
     #[test]

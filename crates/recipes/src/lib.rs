@@ -7,6 +7,7 @@ pub mod commands;
 pub mod config_file;
 mod model_choice;
 pub mod sheet;
+pub mod show;
 pub mod tensors;
 
 pub use model_choice::ModelChoice;

@@ -15,6 +15,13 @@ pub fn view_mask(arrays: &ViewArrays, device: &Device) -> Tensor<2, Bool> {
     Tensor::from_data(TensorData::new(arrays.mask.clone(), [arrays.batch, arrays.views]), device)
 }
 
+/// `[B, V, 1, H, W]`, 1 where a pixel counts, else 0; `None` when every pixel of every camera does.
+pub fn counted_pixels(arrays: &ViewArrays, device: &Device) -> Option<Tensor<5>> {
+    let values = || arrays.pixel_mask.iter().map(|counts| f32::from(u8::from(*counts))).collect::<Vec<f32>>();
+    let shape = [arrays.batch, arrays.views, 1, arrays.height, arrays.width];
+    arrays.has_ignored_pixels().then(|| Tensor::from_data(TensorData::new(values(), shape), device))
+}
+
 /// Matrices of the cameras that look.
 pub fn encode_cameras(arrays: &ViewArrays, device: &Device) -> ViewMatrices {
     matrices(arrays, &arrays.img_from_ego, device)

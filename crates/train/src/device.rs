@@ -45,12 +45,12 @@ impl DeviceConfig {
         }
     }
 
-    /// How many micro batches of one step should be computed side by side: the threads of a CPU, one on a GPU, which is busy
-    /// with one.
+    /// How many micro batches of one step should be computed side by side: one per thread on flex, at least two; one on a GPU, which is
+    /// busy with it, and on ndarray, which is for comparisons.
     pub fn lanes(self) -> usize {
         match self {
-            Self::Flex | Self::NdArray => rayon::current_num_threads(),
-            Self::Wgpu | Self::Vulkan | Self::Metal | Self::Cuda | Self::Rocm => 1,
+            Self::Flex => rayon::current_num_threads().max(2),
+            Self::NdArray | Self::Wgpu | Self::Vulkan | Self::Metal | Self::Cuda | Self::Rocm => 1,
         }
     }
 

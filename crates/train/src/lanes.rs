@@ -6,7 +6,10 @@
 /// Work that differentiates must not share tracked parameters between items: give each its own
 /// [fork](burn::module::Module::fork), else burn joins their graphs under one lock.
 pub fn in_lanes<T: Sync, R: Send>(items: &[T], lanes: usize, work: impl Fn(usize, &T) -> R + Sync) -> Vec<R> {
-    let lanes = lanes.max(1);
+    if lanes <= 1 {
+        // A GPU's queue is fed from the caller's thread.
+        return items.iter().enumerate().map(|(place, item)| work(place, item)).collect();
+    }
     let mut results = Vec::with_capacity(items.len());
     for (wave, part) in items.chunks(lanes).enumerate() {
         let mut slots: Vec<Option<R>> = part.iter().map(|_| None).collect();

@@ -6,17 +6,42 @@ use burn::tensor::activation::relu;
 use burn::tensor::{Bool, Int, Tensor, TensorData};
 use nn::layout::patches_from_image;
 
-/// Mean squared difference over valid views (item 2).
+/// Mean squared difference over valid views (item 2). Where a dataset has pixels to ignore, a view's mean is over those that count.
 ///
 /// # Shapes
 /// - decoded, target: `[B, V, 3, H, W]`
 /// - mask: `[B, V]`
+/// - counted: `[B, V, 1, H, W]`, 1 where a pixel counts, else 0; `None` when all do
 /// - output: `[1]`
-pub fn masked_l2(decoded: Tensor<5>, target: Tensor<5>, mask: Tensor<2, Bool>) -> Tensor<1> {
+pub fn masked_l2(
+    decoded: Tensor<5>,
+    target: Tensor<5>,
+    mask: Tensor<2, Bool>,
+    counted: Option<Tensor<5>>,
+) -> Tensor<1> {
     let [b, v, c, h, w] = decoded.dims();
-    let per_view = (decoded - target).square().reshape([b, v, c * h * w]).mean_dim(2).reshape([b, v]);
+    let squares = (decoded - target).square();
+    let per_view = match counted {
+        None => squares.reshape([b, v, c * h * w]).mean_dim(2),
+        Some(counted) => {
+            let sum = (squares * counted.clone()).reshape([b, v, c * h * w]).sum_dim(2);
+            // A view without any counted pixel has the error 0.
+            sum / counted.reshape([b, v, h * w]).sum_dim(2).mul_scalar(c as f64).clamp_min(1.0)
+        }
+    };
     let weights = mask.float();
-    (per_view * weights.clone()).sum() / weights.sum()
+    (per_view.reshape([b, v]) * weights.clone()).sum() / weights.sum()
+}
+
+/// The target's pixels where a pixel does not count, so that networks which look at whole pictures find no difference there.
+///
+/// # Shapes
+/// As [`masked_l2`].
+pub fn with_ignored_pixels_of(decoded: Tensor<5>, target: &Tensor<5>, counted: Option<&Tensor<5>>) -> Tensor<5> {
+    match counted {
+        None => decoded,
+        Some(counted) => target.clone() + (decoded - target.clone()) * counted.clone(),
+    }
 }
 
 /// Hinge loss of the discriminator: mean max(0, 1 − D(x)) + mean max(0, 1 + D(x̂)) (item 5).

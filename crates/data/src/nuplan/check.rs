@@ -3,7 +3,7 @@
 use super::NuPlan;
 use super::config::NuPlanConfig;
 use crate::DataError;
-use crate::nuscenes::{CheckReport, check_dataset};
+use crate::check::{CheckReport, check as check_dataset};
 
 /// What a check of the chosen logs found.
 #[derive(Debug)]
@@ -14,8 +14,8 @@ pub struct NuPlanCheck {
     pub logs_without_pictures: Vec<String>,
 }
 
-/// Opens the databases, looks at every picture of every frame (existence, size, end), reads every frame's boxes and decodes `decode` pictures
-/// of each log completely, spread evenly over it.
+/// Opens the databases, looks at every picture of every frame (existence, size, end), reads every frame's boxes and decodes `decode`
+/// random pictures of each log completely.
 ///
 /// # Errors
 /// Broken databases and poses; broken pictures are listed in the report.

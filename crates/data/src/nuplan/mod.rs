@@ -180,6 +180,20 @@ impl SceneDataset for NuPlan {
         &self.config.name
     }
 
+    fn notes(&self) -> Vec<String> {
+        let silent = &self.logs_without_pictures;
+        let absent: usize = self.logs.iter().map(|log| log.absent_pictures).sum();
+        let logs = silent.len() + self.logs.len();
+        let mut notes = Vec::new();
+        if absent > 0 {
+            notes.push(format!("{absent} rows of pictures that are not there, in logs that have some"));
+        }
+        if !silent.is_empty() {
+            notes.push(format!("{} of {logs} logs without pictures: {}", silent.len(), silent.join(", ")));
+        }
+        notes
+    }
+
     fn capabilities(&self) -> Capabilities {
         Capabilities {
             boxes: self.logs.iter().any(|log| log.classes.is_some()),

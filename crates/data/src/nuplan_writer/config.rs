@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::nuscenes_writer::{Manifest, check_names};
+use crate::manifest::WriterManifest;
+use crate::staging::check_names;
 use crate::{DataError, FrameId};
 
 /// Frames of any dataset in the nuPlan layout.
@@ -85,7 +86,7 @@ impl NuPlanWriterConfig {
 }
 
 /// `manifest.json` beside the data.
-pub type NuPlanManifest = Manifest<NuPlanWriterConfig, NuPlanManifestLog>;
+pub type NuPlanManifest = WriterManifest<NuPlanWriterConfig, NuPlanManifestLog>;
 
 /// A log and the frames it was made of.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

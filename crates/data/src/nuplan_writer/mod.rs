@@ -20,8 +20,8 @@ use sha2::{Digest, Sha256};
 
 pub use config::{NuPlanManifest, NuPlanManifestFrame, NuPlanManifestLog, NuPlanWriterConfig};
 
-use crate::nuscenes_writer::files::{self, Staging};
-use crate::nuscenes_writer::{Manifest, hex};
+use crate::manifest::WriterManifest;
+use crate::staging::{self as files, Staging, hex};
 use crate::{DataError, SceneFrame};
 use plan::Plan;
 
@@ -84,7 +84,7 @@ fn manifest(
         };
         NuPlanManifestLog { name: plan.name.clone(), frames: plan.frames.iter().map(frame).collect() }
     });
-    let manifest = Manifest {
+    let manifest = WriterManifest {
         tool: concat!("rigscape ", env!("CARGO_PKG_VERSION")).to_owned(),
         format: RELEASE.to_owned(),
         source: sources.join(", "),

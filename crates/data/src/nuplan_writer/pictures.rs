@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::config::NuPlanWriterConfig;
 use super::plan::{Plan, PlannedImage};
-use crate::nuscenes_writer::files;
+use crate::staging as files;
 use crate::{DataError, ImageSource, jpeg};
 
 /// What the manifest says about the pictures.

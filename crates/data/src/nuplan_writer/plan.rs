@@ -7,7 +7,8 @@ use sha2::{Digest, Sha256};
 
 use super::config::NuPlanWriterConfig;
 use crate::nuplan::{Token, assign_lidar, default_box_window_ms, default_pairing_window_ms, pair, usual_name};
-use crate::nuscenes_writer::{check_names, scaled};
+use crate::nuscenes_writer::scaled;
+use crate::staging::check_names;
 use crate::{DataError, SceneFrame, View};
 
 /// Easting and northing that a UTM zone can hold, metres.

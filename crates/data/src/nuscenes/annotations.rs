@@ -85,17 +85,21 @@ type Parsed = (Annotation, Vec<u32>, Option<Box<str>>);
 
 /// `None` for tables without a single annotation, as those of the test split.
 pub(super) fn read_annotations(config: &NuScenesConfig, base: &Base) -> Result<Option<Annotations>, DataError> {
-    let path = base.path("category");
-    let names = read_all::<CategoryTable, _, _>(&path, |row| Ok(Some((owned(&row.token), owned(&row.name)))))?;
+    let file = base.file("category");
+    let path = file.path().to_owned();
+    let names = read_all::<CategoryTable, _, _>(&file, |row| Ok(Some((owned(&row.token), owned(&row.name)))))?;
     let category_index = index_of(names.iter().map(|row| &*row.0), "category", &path)?;
-    let path = base.path("attribute");
-    let attributes = read_all::<AttributeTable, _, _>(&path, |row| Ok(Some((owned(&row.token), owned(&row.name)))))?;
+    let file = base.file("attribute");
+    let path = file.path().to_owned();
+    let attributes = read_all::<AttributeTable, _, _>(&file, |row| Ok(Some((owned(&row.token), owned(&row.name)))))?;
     let attribute_index = index_of(attributes.iter().map(|row| &*row.0), "attribute", &path)?;
-    let path = base.path("visibility");
-    let levels = read_all::<VisibilityTable, _, _>(&path, |row| Ok(Some(owned(&row.token))))?;
+    let file = base.file("visibility");
+    let path = file.path().to_owned();
+    let levels = read_all::<VisibilityTable, _, _>(&file, |row| Ok(Some(owned(&row.token))))?;
     let visibilities = index_of(levels.iter().map(|token| &**token), "visibility", &path)?;
-    let path = base.path("instance");
-    let instances = read_all::<InstanceTable, _, _>(&path, |row| {
+    let file = base.file("instance");
+    let path = file.path().to_owned();
+    let instances = read_all::<InstanceTable, _, _>(&file, |row| {
         let category = category_index.get(Key::of(row.category_token.as_str())).ok_or_else(|| DataError::Dangling {
             table: "instance",
             token: row.token.as_str().to_owned(),
@@ -133,11 +137,12 @@ pub(super) fn read_annotations(config: &NuScenesConfig, base: &Base) -> Result<O
 impl Annotations {
     /// False when the table has no row at all.
     fn read_rows(&mut self, lookup: &Lookup<'_>, attributes: &[String]) -> Result<bool, DataError> {
-        let path = lookup.base.path("sample_annotation");
+        let file = lookup.base.file("sample_annotation");
+        let path = file.path().to_owned();
         let any = std::sync::atomic::AtomicBool::new(false);
         let mut sets: HashMap<Vec<u32>, u32> = HashMap::new();
         read_table::<AnnotationTable, _, _, _>(
-            &path,
+            &file,
             |row| {
                 any.store(true, std::sync::atomic::Ordering::Relaxed);
                 lookup.parse(&row, &path)

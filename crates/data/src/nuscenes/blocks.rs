@@ -1,10 +1,9 @@
 //! Cuts a table into blocks of whole rows, about a megabyte each, with a scanner that only follows quotes and brackets.
 
-use std::fs::File;
 use std::io::Read;
-use std::path::{Path, PathBuf};
 
 use crate::DataError;
+use crate::store::StoredFile;
 
 /// Bytes after which a block is closed at the next border between rows.
 pub(super) const BLOCK: usize = 1 << 20;
@@ -20,8 +19,8 @@ pub(super) struct Block {
 
 /// Cuts a file into blocks.
 pub(super) struct Blocks {
-    file: File,
-    path: PathBuf,
+    file: StoredFile,
+    stream: Box<dyn Read + Send>,
     block: usize,
     /// Read but not yet handed out; begins with `[` or the comma before the next row.
     buffer: Vec<u8>,
@@ -37,14 +36,14 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    pub fn open(path: &Path, block: usize) -> Result<Self, DataError> {
-        let file = File::open(path).map_err(|source| match source.kind() {
-            std::io::ErrorKind::NotFound => DataError::Missing { what: "table".to_owned(), path: path.to_owned() },
-            _ => DataError::Io { action: "open", source, path: path.to_owned() },
+    pub fn open(file: &StoredFile, block: usize) -> Result<Self, DataError> {
+        let stream = file.reader().map_err(|error| match error {
+            DataError::Missing { path, .. } => DataError::Missing { what: "table".to_owned(), path },
+            other => other,
         })?;
         Ok(Self {
-            file,
-            path: path.to_owned(),
+            file: file.clone(),
+            stream,
             block,
             buffer: Vec::new(),
             offset: 0,
@@ -67,7 +66,7 @@ impl Blocks {
     }
 
     fn bad(&self, why: String) -> DataError {
-        DataError::Json { why, path: self.path.clone() }
+        DataError::Json { why, path: self.file.path().to_owned() }
     }
 
     fn next_block(&mut self) -> Result<Block, DataError> {
@@ -102,11 +101,8 @@ impl Blocks {
 
     fn refill(&mut self) -> Result<usize, DataError> {
         let wanted = self.block as u64;
-        self.file.by_ref().take(wanted).read_to_end(&mut self.buffer).map_err(|source| DataError::Io {
-            action: "read",
-            source,
-            path: self.path.clone(),
-        })
+        let read = self.stream.by_ref().take(wanted).read_to_end(&mut self.buffer);
+        read.map_err(|source| self.file.read_failure(source))
     }
 
     /// Drops blanks before the array and insists on its bracket.
@@ -175,8 +171,8 @@ impl Blocks {
             }
             at += rest.len() as u64;
             rest.clear();
-            let more = self.file.by_ref().take(BLOCK as u64).read_to_end(&mut rest);
-            let more = more.map_err(|source| DataError::Io { action: "read", source, path: self.path.clone() })?;
+            let more = self.stream.by_ref().take(BLOCK as u64).read_to_end(&mut rest);
+            let more = more.map_err(|source| self.file.read_failure(source))?;
             if more == 0 {
                 return Ok(());
             }

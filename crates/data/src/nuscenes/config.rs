@@ -1,20 +1,20 @@
 //! What to read: folder, split, cameras, frames.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use crate::DataError;
 use crate::occupancy::OccupancyConfig;
+use crate::store::Roots;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the nuScenes reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NuScenesConfig {
-    /// Folder that holds the table folder, `samples` and `sweeps`.
-    pub root: PathBuf,
+    /// Folder that holds the table folder, `samples` and `sweeps`; or an archive, or a list of both.
+    pub root: Roots,
     /// Name of the table folder.
     #[serde(default = "default_version")]
     pub version: String,
@@ -55,7 +55,7 @@ pub struct NuScenesConfig {
 
 impl NuScenesConfig {
     /// The defaults for a dataset folder and table folder: every scene, every camera, key frames.
-    pub fn new(root: impl Into<PathBuf>, version: impl Into<String>) -> Self {
+    pub fn new(root: impl Into<Roots>, version: impl Into<String>) -> Self {
         Self {
             root: root.into(),
             version: version.into(),

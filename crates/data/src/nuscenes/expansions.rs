@@ -23,11 +23,10 @@ pub(super) struct Expansions {
 }
 
 impl Expansions {
-    pub(super) fn find(root: &std::path::Path) -> Result<Self, DataError> {
-        let store = Store::open(root)?;
+    pub(super) fn find(store: &Store) -> Result<Self, DataError> {
         let has_json = |folder| Ok::<_, DataError>(store.list(folder)?.iter().any(|file| file.name.ends_with(".json")));
         let (has_maps, has_can_bus) = (has_json(MAP_FOLDER)?, has_json(CAN_FOLDER)?);
-        Ok(Self { store, has_maps, has_can_bus, maps: Mutex::default() })
+        Ok(Self { store: store.clone(), has_maps, has_can_bus, maps: Mutex::default() })
     }
 
     /// Threads that ask at the same time wait for the one that reads.

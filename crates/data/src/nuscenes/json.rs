@@ -11,6 +11,7 @@ use serde::de::{DeserializeSeed, SeqAccess, Visitor};
 use super::blocks::{BLOCK, Block, Blocks};
 use super::rows::{Text, Token};
 use crate::DataError;
+use crate::store::StoredFile;
 
 /// A table's row as it stands in the file, borrowing from the block.
 pub(super) trait TableRow {
@@ -22,14 +23,15 @@ pub(super) trait TableRow {
 ///
 /// # Errors
 /// [`DataError::Missing`], [`DataError::Io`], [`DataError::Json`] with byte and token of the bad row, and whatever `keep` or `sink` return.
-pub(super) fn read_table<T, R, K, S>(path: &Path, keep: K, mut sink: S) -> Result<(), DataError>
+pub(super) fn read_table<T, R, K, S>(file: &StoredFile, keep: K, mut sink: S) -> Result<(), DataError>
 where
     T: TableRow,
     R: Send,
     K: Fn(T::Row<'_>) -> Result<Option<R>, DataError> + Sync,
     S: FnMut(Vec<R>) -> Result<(), DataError> + Send,
 {
-    let mut blocks = Blocks::open(path, BLOCK)?;
+    let path = file.path();
+    let mut blocks = Blocks::open(file, BLOCK)?;
     let at_once = rayon::current_num_threads().max(1) * 2;
     let mut batch = blocks.take(at_once)?;
     while !batch.is_empty() {
@@ -44,14 +46,14 @@ where
 }
 
 /// [`read_table`] for small tables: all rows at once.
-pub(super) fn read_all<T, R, K>(path: &Path, keep: K) -> Result<Vec<R>, DataError>
+pub(super) fn read_all<T, R, K>(file: &StoredFile, keep: K) -> Result<Vec<R>, DataError>
 where
     T: TableRow,
     R: Send,
     K: Fn(T::Row<'_>) -> Result<Option<R>, DataError> + Sync,
 {
     let mut rows = Vec::new();
-    read_table::<T, R, K, _>(path, keep, |part| {
+    read_table::<T, R, K, _>(file, keep, |part| {
         rows.extend(part);
         Ok(())
     })?;
@@ -156,7 +158,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.json");
         std::fs::write(&path, text).unwrap();
-        let mut blocks = Blocks::open(&path, block)?;
+        let mut blocks = Blocks::open(&path.into(), block)?;
         blocks.take(usize::MAX)
     }
 

@@ -7,7 +7,6 @@ mod annotations;
 mod blocks;
 mod boxes;
 mod can_bus;
-mod check;
 mod config;
 mod expansions;
 mod json;
@@ -20,16 +19,14 @@ mod tables;
 mod token;
 
 use std::ops::Range;
-use std::path::PathBuf;
 
-use geometry::{GeometryError, Lens, PoseTrack, Rigid};
+use geometry::{CameraRig, GeometryError, Lens, PoseTrack, RigCamera, Rigid};
 
+pub use crate::check::CheckReport;
+pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
 pub use can_bus::{CanBus, CanMessage, CanSignal, CanState};
-pub use check::{CheckReport, check, check_dataset};
 pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
-
-pub use crate::taxonomy::ClassRule;
 
 use annotations::Annotations;
 use expansions::Expansions;
@@ -39,7 +36,8 @@ use sets::{PictureSet, SceneRig, Slot};
 use tables::Base;
 
 use crate::{
-    Capabilities, DataError, FrameId, ImageSource, LocalMap, ObjectBox, OccupancyGrid, SceneDataset, SceneFrame, View,
+    Capabilities, DataError, FrameId, FrameOutline, ImageSource, LocalMap, ObjectBox, ObjectClass, OccupancyGrid,
+    SceneDataset, SceneFrame, View,
 };
 
 /// A lidar key row whose pose is further from its sample's stamp than this does not belong to that instant (interpolated tables).
@@ -49,7 +47,6 @@ const SAME_INSTANT_NS: i64 = 1_000_000;
 #[derive(Debug)]
 pub struct NuScenes {
     config: NuScenesConfig,
-    root: PathBuf,
     base: Base,
     pictures: Pictures,
     annotations: Option<Annotations>,
@@ -87,10 +84,9 @@ impl NuScenes {
             rayon::join(|| pictures::read_pictures(config, &base), || annotations::read_annotations(config, &base));
         let (pictures, annotations) = (pictures?, annotations?);
         let (rigs, sets, ranges) = sets::group(config, &base, &pictures)?;
-        let root = base.folder.parent().map(ToOwned::to_owned).unwrap_or_default();
-        let expansions = Expansions::find(&root)?;
+        let expansions = Expansions::find(&base.tables.store)?;
         let config = config.clone();
-        Ok(Self { config, root, base, pictures, annotations, expansions, occupancy, rigs, sets, ranges })
+        Ok(Self { config, base, pictures, annotations, expansions, occupancy, rigs, sets, ranges })
     }
 
     /// The scenes in frame order.
@@ -144,15 +140,34 @@ impl NuScenes {
         if let Some(sample) = set.sample {
             return Some(boxes::at_sample(annotations, &self.base, sample as usize));
         }
+        let (after, mode) = self.sample_behind(set, time_ns)?;
+        boxes::before_sample(annotations, &self.base, after, time_ns, mode)
+    }
+
+    /// The sample at or behind an instant between samples, and how to find boxes there; nothing is defined behind the last one.
+    fn sample_behind(&self, set: &PictureSet, time_ns: i64) -> Option<(usize, BoxMode)> {
         let FrameChoice::AllPictures { boxes: mode, .. } = self.config.frames else { return None };
         let samples = self.base.scenes[set.scene as usize].samples.clone();
         let after =
             samples.start + self.base.samples[samples.clone()].partition_point(|sample| sample.time_ns < time_ns);
-        // Nothing is defined behind the last sample.
-        if after == samples.end {
-            return None;
-        }
-        boxes::before_sample(annotations, &self.base, after, time_ns, mode)
+        (after < samples.end).then_some((after, mode))
+    }
+
+    /// Whether [`NuScenes::boxes_of`] gives a list.
+    fn has_boxes(&self, set: &PictureSet, time_ns: i64) -> bool {
+        let first = self.base.scenes[set.scene as usize].samples.start;
+        let between =
+            || self.sample_behind(set, time_ns).is_some_and(|(after, mode)| after > first || mode == BoxMode::Devkit);
+        self.annotations.is_some() && (set.sample.is_some() || between())
+    }
+
+    fn rig_camera(&self, slot: &Slot, picture: Option<u32>) -> Result<RigCamera, DataError> {
+        let picture = picture.map(|row| &self.pictures.rows[row as usize]);
+        let (sensor, size) = picture.map_or((slot.sensor, slot.size), |picture| (picture.sensor, picture.size));
+        let (intrinsics, ego_from_cam) = sets::intrinsics(&self.base, sensor, size)
+            .ok_or_else(|| DataError::Config("a picture without a camera".to_owned()))?;
+        let channel = self.base.channels[slot.channel as usize].to_string();
+        Ok(RigCamera { channel, intrinsics, lens: Lens::Pinhole, ego_from_cam })
     }
 
     /// The car at an instant. Where no pose row follows (or precedes) within the allowed gap, the nearest row and its own stamp, so that
@@ -190,10 +205,8 @@ impl NuScenes {
     }
 
     fn view(&self, set: &PictureSet, slot: &Slot, picture: Option<u32>, reference: &Rigid) -> Result<View, DataError> {
+        let RigCamera { channel, intrinsics, lens, ego_from_cam } = self.rig_camera(slot, picture)?;
         let picture = picture.map(|row| &self.pictures.rows[row as usize]);
-        let (sensor, size) = picture.map_or((slot.sensor, slot.size), |picture| (picture.sensor, picture.size));
-        let (intrinsics, ego_from_cam) = sets::intrinsics(&self.base, sensor, size)
-            .ok_or_else(|| DataError::Config("a picture without a camera".to_owned()))?;
         let (timestamp_ns, world_from_ego) = match picture {
             Some(picture) => (picture.time_ns, self.pictures.poses[picture.pose as usize].world_from_ego),
             // When it would have been taken; its pose only places the camera, so the reference pose serves where no row is near.
@@ -203,20 +216,20 @@ impl NuScenes {
             }
         };
         let image = picture.map(|picture| ImageSource::File {
-            file: self.root.join(self.pictures.file_name(picture, &self.base)).into(),
+            file: self.base.tables.store.expected(&self.pictures.file_name(picture, &self.base)),
             size: picture.size,
         });
-        Ok(View {
-            channel: self.base.channels[slot.channel as usize].to_string(),
-            timestamp_ns,
-            image,
-            mask: None,
-            intrinsics,
-            lens: Lens::Pinhole,
-            ego_from_cam,
-            world_from_ego,
-        })
+        Ok(View { channel, timestamp_ns, image, mask: None, intrinsics, lens, ego_from_cam, world_from_ego })
     }
+}
+
+/// Opens the tables, looks at every picture of every frame (existence, size, end) and decodes `decode` random pictures of each scene
+/// completely.
+///
+/// # Errors
+/// Broken tables and poses; broken pictures are listed in the report.
+pub fn check(config: &NuScenesConfig, decode: usize) -> Result<CheckReport, DataError> {
+    crate::check(&NuScenes::open(config)?, decode)
 }
 
 impl SceneDataset for NuScenes {
@@ -244,6 +257,20 @@ impl SceneDataset for NuScenes {
             boxes,
             scene_text: (!scene.description.is_empty()).then(|| scene.description.to_string()),
         })
+    }
+
+    fn outline(&self, index: usize) -> Result<FrameOutline, DataError> {
+        let set = self.set(index)?;
+        let (timestamp_ns, _) = self.reference(set)?;
+        let slots = self.rigs[set.scene as usize].slots.iter().zip(&set.pictures);
+        let cameras = slots.map(|(slot, picture)| self.rig_camera(slot, *picture)).collect::<Result<_, _>>()?;
+        Ok(FrameOutline { timestamp_ns, rig: CameraRig { cameras }, annotated: self.has_boxes(set, timestamp_ns) })
+    }
+
+    fn box_classes(&self, index: usize) -> Result<Vec<ObjectClass>, DataError> {
+        let set = self.set(index)?;
+        let boxes = self.boxes_of(set, self.reference(set)?.0);
+        Ok(boxes.into_iter().flatten().map(|found| found.class).collect())
     }
 
     fn scene_ranges(&self) -> Vec<Range<usize>> {

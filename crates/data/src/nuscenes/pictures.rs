@@ -81,10 +81,11 @@ struct Kept {
 
 /// Reads `sample_data`, then the pose rows it needs.
 pub(super) fn read_pictures(config: &NuScenesConfig, base: &Base) -> Result<Pictures, DataError> {
-    let path = base.path("sample_data");
+    let file = base.file("sample_data");
+    let path = file.path().to_owned();
     let mut kept: Vec<Kept> = Vec::new();
     read_table::<SampleDataTable, _, _, _>(
-        &path,
+        &file,
         |row| keep_row(&row, config, base, &path),
         |part| {
             kept.extend(part);
@@ -236,10 +237,11 @@ pub(super) fn check_relative(name: &str, table: &Path) -> Result<(), DataError> 
 
 /// The wanted pose rows, in the order of `wanted` (ascending keys).
 fn read_poses(base: &Base, wanted: &[Key]) -> Result<Vec<Option<Pose>>, DataError> {
-    let path = base.path("ego_pose");
+    let file = base.file("ego_pose");
+    let path = file.path().to_owned();
     let mut poses: Vec<Option<Pose>> = vec![None; wanted.len()];
     read_table::<EgoPoseTable, _, _, _>(
-        &path,
+        &file,
         |row| {
             let token = row.token.as_str();
             let Ok(at) = wanted.binary_search(&Key::of(token)) else { return Ok(None) };

@@ -13,6 +13,7 @@ use super::rows::{
 };
 use super::token::{Index, Key, index_of};
 use crate::DataError;
+use crate::store::{Store, StoredFile};
 
 /// Marks a row that exists but is not wanted.
 pub(super) const SKIPPED: u32 = u32::MAX;
@@ -63,10 +64,24 @@ pub(super) struct Prior {
     pub log_tokens: Vec<Box<str>>,
 }
 
+/// Where the tables and everything they name lie.
+#[derive(Debug)]
+pub(super) struct Tables {
+    pub store: Store,
+    version: String,
+}
+
+impl Tables {
+    /// A table's file; its absence shows when it is read.
+    fn file(&self, table: &str) -> StoredFile {
+        self.store.expected(&format!("{}/{table}.json", self.version))
+    }
+}
+
 /// The small tables.
 #[derive(Debug)]
 pub(super) struct Base {
-    pub folder: PathBuf,
+    pub tables: Tables,
     pub priors: Vec<Prior>,
     pub scenes: Vec<Scene>,
     pub samples: Vec<Sample>,
@@ -79,8 +94,13 @@ pub(super) struct Base {
 }
 
 impl Base {
+    pub fn file(&self, table: &str) -> StoredFile {
+        self.tables.file(table)
+    }
+
+    /// For messages.
     pub fn path(&self, table: &str) -> PathBuf {
-        table_path(&self.folder, table)
+        self.file(table).path().to_owned()
     }
 
     /// The sample a token names: `None` for one of a scene that is not read.
@@ -94,38 +114,31 @@ impl Base {
     }
 }
 
-pub(super) fn table_path(folder: &Path, table: &str) -> PathBuf {
-    folder.join(format!("{table}.json"))
-}
-
 /// Reads and checks them.
 pub(super) fn read_base(config: &NuScenesConfig) -> Result<Base, DataError> {
-    let root = std::path::absolute(&config.root).map_err(|source| DataError::Io {
-        action: "resolve",
-        source,
-        path: config.root.clone(),
-    })?;
-    let folder = root.join(&config.version);
-    if !folder.is_dir() {
-        return Err(DataError::Missing { what: "table folder".to_owned(), path: folder });
+    let store = Store::open_all(&config.root)?;
+    if store.list(&config.version)?.is_empty() {
+        return Err(DataError::Missing { what: "table folder".to_owned(), path: store.path(&config.version) });
     }
-    let (channels, sensors, sensor_index) = read_sensors(config, &folder)?;
-    let priors = read_all::<MapTable, _, _>(&table_path(&folder, "map"), |row| {
+    let tables = Tables { store, version: config.version.clone() };
+    let (channels, sensors, sensor_index) = read_sensors(config, &tables)?;
+    let priors = read_all::<MapTable, _, _>(&tables.file("map"), |row| {
         let logs = row.log_tokens.iter().map(owned).collect();
         Ok(row.filename.map(|name| Prior { file_name: owned(&name), log_tokens: logs }))
     })?;
-    let (mut scenes, scene_rows, scene_index, ends) = read_scenes(config, &folder)?;
-    let (samples, sample_rows, sample_index) = read_samples(&folder, &mut scenes, &scene_rows, &scene_index)?;
-    let base = Base { folder, scenes, samples, sample_rows, sample_index, sensors, sensor_index, channels, priors };
+    let (mut scenes, scene_rows, scene_index, ends) = read_scenes(config, &tables)?;
+    let (samples, sample_rows, sample_index) = read_samples(&tables, &mut scenes, &scene_rows, &scene_index)?;
+    let base = Base { tables, scenes, samples, sample_rows, sample_index, sensors, sensor_index, channels, priors };
     check_ends(&base, &ends)?;
     Ok(base)
 }
 
 type Sensors = (Vec<Box<str>>, Vec<Sensor>, Index);
 
-fn read_sensors(config: &NuScenesConfig, folder: &Path) -> Result<Sensors, DataError> {
-    let path = table_path(folder, "sensor");
-    let rows = read_all::<SensorTable, _, _>(&path, |row| {
+fn read_sensors(config: &NuScenesConfig, tables: &Tables) -> Result<Sensors, DataError> {
+    let file = tables.file("sensor");
+    let path = file.path().to_owned();
+    let rows = read_all::<SensorTable, _, _>(&file, |row| {
         Ok(Some((owned(&row.token), owned(&row.channel), owned(&row.modality))))
     })?;
     let index = index_of(rows.iter().map(|row| &*row.0), "sensor", &path)?;
@@ -136,8 +149,9 @@ fn read_sensors(config: &NuScenesConfig, folder: &Path) -> Result<Sensors, DataE
     }
     let wanted = |channel: &str| config.cameras.is_empty() || config.cameras.iter().any(|name| name == channel);
     let channels: Vec<Box<str>> = rows.iter().map(|row| row.1.clone()).collect();
-    let path = table_path(folder, "calibrated_sensor");
-    let parsed = read_all::<CalibratedSensorTable, _, _>(&path, |row| {
+    let file = tables.file("calibrated_sensor");
+    let path = file.path().to_owned();
+    let parsed = read_all::<CalibratedSensorTable, _, _>(&file, |row| {
         let Some(at) = index.get(Key::of(row.sensor_token.as_str())) else {
             return Err(DataError::Dangling {
                 table: "calibrated_sensor",
@@ -192,14 +206,16 @@ type Ends = Vec<[Box<str>; 2]>;
 /// The selected scenes, the row of every scene of the table in them, its index, and the selected scenes' ends.
 type Scenes = (Vec<Scene>, Vec<u32>, Index, Ends);
 
-fn read_scenes(config: &NuScenesConfig, folder: &Path) -> Result<Scenes, DataError> {
-    let path = table_path(folder, "log");
-    let logs = read_all::<LogTable, _, _>(&path, |row| {
+fn read_scenes(config: &NuScenesConfig, tables: &Tables) -> Result<Scenes, DataError> {
+    let file = tables.file("log");
+    let path = file.path().to_owned();
+    let logs = read_all::<LogTable, _, _>(&file, |row| {
         Ok(Some((owned(&row.token), owned(&row.logfile), owned(&row.location))))
     })?;
     let log_index = index_of(logs.iter().map(|row| &*row.0), "log", &path)?;
-    let path = table_path(folder, "scene");
-    let rows = read_all::<SceneTable, _, _>(&path, |row| {
+    let file = tables.file("scene");
+    let path = file.path().to_owned();
+    let rows = read_all::<SceneTable, _, _>(&file, |row| {
         let log = log_index.get(Key::of(row.log_token.as_str())).ok_or_else(|| DataError::Dangling {
             table: "scene",
             token: row.token.as_str().to_owned(),
@@ -275,13 +291,14 @@ type Samples = (Vec<Sample>, Vec<u32>, Index);
 
 /// All samples for the index, those of selected scenes ordered by scene and time.
 fn read_samples(
-    folder: &Path,
+    tables: &Tables,
     scenes: &mut [Scene],
     scene_rows: &[u32],
     scene_index: &Index,
 ) -> Result<Samples, DataError> {
-    let path = table_path(folder, "sample");
-    let rows = read_all::<SampleTable, _, _>(&path, |row| {
+    let file = tables.file("sample");
+    let path = file.path().to_owned();
+    let rows = read_all::<SampleTable, _, _>(&file, |row| {
         let scene = scene_index.get(Key::of(row.scene_token.as_str())).ok_or_else(|| DataError::Dangling {
             table: "sample",
             token: row.token.as_str().to_owned(),

@@ -9,12 +9,12 @@ use glam::DVec2;
 use sha2::{Digest, Sha256};
 use world::{MapAreaKind, TrafficSide, World};
 
-use super::files;
 use super::map_expansion::{MapBuilder, areas, shifted};
 use super::prior::{self, Rings};
 use super::tables::{MapRow, Tables};
-use super::tokens::{TokenSpace, hex};
-use crate::DataError;
+use super::tokens::TokenSpace;
+use crate::manifest::hex;
+use crate::{DataError, staging};
 
 /// Empty ground around every world, metres.
 const MARGIN_M: f64 = 10.0;
@@ -65,18 +65,18 @@ impl<'a> Atlas<'a> {
     /// Writes priors and expansions, fills the map table and returns the files' SHA-256.
     pub(super) fn write(self, root: &Path, tables: &mut Tables) -> Result<BTreeMap<String, String>, DataError> {
         let mut digests = BTreeMap::new();
-        files::create_dir(&root.join("maps/expansion"))?;
+        staging::create_dir(&root.join("maps/expansion"))?;
         for sheet in self.sheets {
             let token = self.tokens.token("map", sheet.location);
             let png = format!("maps/{token}.png");
             prior::write(&root.join(&png), sheet.canvas, &sheet.drivable)?;
-            let bytes = std::fs::read(root.join(&png)).map_err(files::io("read", &root.join(&png)))?;
+            let bytes = std::fs::read(root.join(&png)).map_err(staging::io("read", &root.join(&png)))?;
             digests.insert(png.clone(), hex(&Sha256::digest(&bytes)));
             let json = format!("maps/expansion/{}.json", sheet.location);
             let path = root.join(&json);
             let bytes = serde_json::to_vec(&sheet.builder.finish(sheet.canvas))
                 .map_err(|e| DataError::Json { why: e.to_string(), path: path.clone() })?;
-            files::write(&path, &bytes)?;
+            staging::write(&path, &bytes)?;
             digests.insert(json, hex(&Sha256::digest(&bytes)));
             tables.map.push(MapRow { category: "semantic_prior", token, filename: png, log_tokens: sheet.log_tokens });
         }

@@ -1,6 +1,5 @@
 //! What to write, and what was written.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use geometry::{CameraRig, Intrinsics, Lens, RigCamera};
@@ -9,6 +8,8 @@ use world::{RenderOptions, WorldConfig};
 
 use super::timing;
 use crate::DataError;
+use crate::manifest::WriterManifest;
+use crate::staging::check_names;
 
 /// Names of the official mini split. Scenes borrow them so that `mini_train` and `mini_val` of any tool select scenes.
 const MINI_TRAIN: [&str; 8] =
@@ -158,54 +159,14 @@ impl NuScenesWriterConfig {
     }
 }
 
-/// Names become parts of paths and keys: plain and different from each other.
-pub(crate) fn check_names(what: &str, names: &[String]) -> Result<(), DataError> {
-    let mut sorted: Vec<&String> = names.iter().collect();
-    sorted.sort();
-    if let Some(twice) = sorted.windows(2).find(|pair| pair[0] == pair[1]) {
-        return Err(DataError::Config(format!("{what} {:?} occurs twice", twice[0])));
-    }
-    let plain = |name: &str| {
-        !name.is_empty()
-            && !name.starts_with('.')
-            && name.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.'))
-    };
-    match names.iter().find(|name| !plain(name)) {
-        Some(name) => {
-            Err(DataError::Config(format!("{what} {name:?} may hold letters, digits, '-', '_' and '.' only")))
-        }
-        None => Ok(()),
-    }
-}
-
 /// In our pixel convention a resize scales all four numbers.
 pub(crate) fn scaled(raw: &Intrinsics, (width, height): (u32, u32)) -> Intrinsics {
     let (sx, sy) = (f64::from(width) / f64::from(raw.width), f64::from(height) / f64::from(raw.height));
     Intrinsics { fx: raw.fx * sx, fy: raw.fy * sy, cx: raw.cx * sx, cy: raw.cy * sy, width, height }
 }
 
-/// `manifest.json` beside the data: enough to make the same bytes again and to compare with the world they show.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Manifest<C = NuScenesWriterConfig, S = ManifestScene> {
-    /// Name and version of the tool.
-    pub tool: String,
-    /// Layout of the folder.
-    pub format: String,
-    /// Where the content comes from.
-    pub source: String,
-    /// Codec, quality and whether pictures were resampled.
-    pub pictures: String,
-    /// How many pictures there are.
-    pub picture_count: usize,
-    /// SHA-256 of `config` as compact JSON.
-    pub config_sha256: String,
-    /// All settings that shape the bytes.
-    pub config: C,
-    /// The scenes in order.
-    pub scenes: Vec<S>,
-    /// SHA-256 of every table and map, by path inside the folder.
-    pub sha256: BTreeMap<String, String>,
-}
+/// `manifest.json` beside the data.
+pub type Manifest = WriterManifest<NuScenesWriterConfig, ManifestScene>;
 
 /// How a scene of the dataset came about.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -9,7 +9,6 @@ mod annotations;
 mod arcline;
 mod atlas;
 mod config;
-pub(crate) mod files;
 mod lidar;
 mod map_expansion;
 mod map_rows;
@@ -24,19 +23,18 @@ mod visibility;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use sha2::{Digest, Sha256};
 use world::{World, WorldConfig};
 
+pub(crate) use config::scaled;
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
-pub(crate) use config::{check_names, scaled};
 
 use crate::DataError;
+use crate::manifest::{Contents, WriterManifest};
+use crate::staging::{self, Staging};
 use atlas::Atlas;
-use files::Staging;
 use scene::{Scene, Studio};
 use tables::{LogRow, SensorRow, Tables};
 use tokens::TokenSpace;
-pub(crate) use tokens::hex;
 
 /// 2031-01-01 00:00 UTC, after all drives of the release.
 const FIRST_START_US: i64 = 1_924_992_000_000_000;
@@ -119,12 +117,12 @@ fn plan_scenes(
 }
 
 fn make_folders(studio: &Studio<'_>) -> Result<(), DataError> {
-    files::create_dir(&studio.root.join(&studio.config.version))?;
-    files::create_dir(&studio.root.join("samples").join(lidar::CHANNEL))?;
+    staging::create_dir(&studio.root.join(&studio.config.version))?;
+    staging::create_dir(&studio.root.join("samples").join(lidar::CHANNEL))?;
     for camera in &studio.cameras {
-        files::create_dir(&studio.root.join("samples").join(&camera.channel))?;
+        staging::create_dir(&studio.root.join("samples").join(&camera.channel))?;
         if studio.config.sweeps {
-            files::create_dir(&studio.root.join("sweeps").join(&camera.channel))?;
+            staging::create_dir(&studio.root.join("sweeps").join(&camera.channel))?;
         }
     }
     Ok(())
@@ -173,21 +171,14 @@ fn manifest(
     sha256: BTreeMap<String, String>,
     root: &Path,
 ) -> Result<Manifest, DataError> {
-    let path = root.join(files::MANIFEST);
-    let json = |e: serde_json::Error| DataError::Json { why: e.to_string(), path: path.clone() };
-    let manifest = Manifest {
-        tool: concat!("rigscape ", env!("CARGO_PKG_VERSION")).to_owned(),
-        format: "nuscenes".to_owned(),
+    let contents = Contents {
+        format: "nuscenes",
         source: "procedural world".to_owned(),
         pictures: format!("jpeg, quality {}; rendered at the written size, not resampled", config.jpeg_quality),
         picture_count,
-        config_sha256: hex(&Sha256::digest(serde_json::to_vec(config).map_err(json)?)),
-        config: config.clone(),
-        scenes,
         sha256,
     };
-    files::write(&path, &serde_json::to_vec_pretty(&manifest).map_err(json)?)?;
-    Ok(manifest)
+    WriterManifest::write(contents, config, scenes, root)
 }
 
 #[cfg(test)]

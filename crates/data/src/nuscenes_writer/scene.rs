@@ -15,8 +15,8 @@ use super::tables::{CalibratedSensorRow, EgoPoseRow, LogRow, SampleDataRow, Samp
 use super::timing::{self, Exposure, Timetable, TimingPlan};
 use super::tokens::TokenSpace;
 use super::visibility::{self, Sight};
-use super::{annotations, files, lidar};
-use crate::DataError;
+use super::{annotations, lidar};
+use crate::{DataError, staging};
 
 /// What all scenes share.
 #[derive(Debug)]
@@ -177,7 +177,7 @@ impl Studio<'_> {
         let world_from_cam = scene.world.world_from_ego(time_secs) * shot.camera.ego_from_cam;
         let snapshot = scene.world.snapshot(time_secs);
         let picture = snapshot.render_serial(&camera, &world_from_cam, &self.config.render);
-        files::write(&path, &self.encode(&picture, &path)?)?;
+        staging::write(&path, &self.encode(&picture, &path)?)?;
         if !shot.exposure.is_key_frame {
             return Ok(BTreeMap::new());
         }
@@ -210,7 +210,7 @@ impl Studio<'_> {
         for (index, time_us) in timetable.samples_us.iter().enumerate() {
             let world_from_lidar = scene.world.world_from_ego(secs(*time_us)) * ego_from_lidar;
             let turn = lidar::cast(&scene.world.snapshot(secs(*time_us)), &world_from_lidar, self.config.lidar_columns);
-            files::write(&self.root.join(&names[index]), &turn.bytes)?;
+            staging::write(&self.root.join(&names[index]), &turn.bytes)?;
             evidence[index].lidar_points = turn.points;
             let (prev, next) = neighbours(&tokens, index);
             let token = tokens[index].clone();

@@ -8,8 +8,9 @@ use std::path::Path;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 
-use super::tokens::{TokenSpace, hex};
-use crate::DataError;
+use super::tokens::TokenSpace;
+use crate::manifest::hex;
+use crate::{DataError, staging};
 
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct NamedRow {
@@ -222,7 +223,7 @@ impl Tables {
             let path = folder.join(format!("{name}.json"));
             let bytes = text.map_err(|e| DataError::Json { why: e.to_string(), path: path.clone() })?;
             digests.insert(format!("{name}.json"), hex(&Sha256::digest(&bytes)));
-            super::files::write(&path, &bytes)
+            staging::write(&path, &bytes)
         };
         put("attribute", lines(&self.attribute))?;
         put("calibrated_sensor", lines(&self.calibrated_sensor))?;

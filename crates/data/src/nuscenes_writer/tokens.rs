@@ -2,6 +2,8 @@
 
 use sha2::{Digest, Sha256};
 
+use crate::manifest::hex;
+
 /// Names rows of one dataset; datasets of different seeds share no token.
 #[derive(Debug, Clone)]
 pub(super) struct TokenSpace {
@@ -40,11 +42,6 @@ impl TokenSpace {
         // 53 bits fill an f64's mantissa exactly.
         (self.seed(purpose, name) >> 11) as f64 / (1_u64 << 53) as f64
     }
-}
-
-/// Lower-case hexadecimal digits.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ mod broken;
 mod can_bus;
 mod fixture;
 mod golden;
-mod made;
+pub mod made;
 mod map;
 mod occupancy;
 mod reading;
@@ -16,7 +16,7 @@ use data::{ImageSource, SceneDataset, SceneFrame};
 use serde_json::Value;
 
 /// A folder named by an environment variable. Without the variable `None`, with a note; with it, a missing folder fails the test.
-pub(crate) fn folder(variable: &str, inside: &str) -> Option<PathBuf> {
+pub fn folder(variable: &str, inside: &str) -> Option<PathBuf> {
     match std::env::var_os(variable) {
         Some(root) => {
             let path = Path::new(&root).join(inside);
@@ -43,12 +43,12 @@ fn golden_folder(inside: &str) -> Option<PathBuf> {
     Some(path)
 }
 
-pub(crate) fn json(path: &Path) -> Value {
+pub fn json(path: &Path) -> Value {
     let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-pub(crate) fn floats<const N: usize>(value: &Value) -> [f64; N] {
+pub fn floats<const N: usize>(value: &Value) -> [f64; N] {
     let list: Vec<f64> = value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect();
     list.try_into().unwrap()
 }
@@ -61,9 +61,9 @@ fn open(config: &NuScenesConfig) -> NuScenes {
     NuScenes::open(config).unwrap()
 }
 
-pub(crate) fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
+pub fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
     match source? {
         ImageSource::File { file, .. } => Some(file.path()),
-        ImageSource::Rendered { .. } => None,
+        ImageSource::Rendered { .. } | ImageSource::Embedded { .. } => None,
     }
 }

@@ -89,7 +89,7 @@ impl Ddpm {
             let posterior = Posterior::new(level, next);
             let mean = clean * posterior.clean + x * posterior.noisy;
             let last = step + 1 == timesteps.len();
-            x = if last { mean } else { mean + (oracle.noise)() * posterior.deviation(self.variance, fraction) };
+            x = if last { mean } else { mean + posterior.scaled((oracle.noise)(), self.variance, fraction) };
             oracle.report(step + 1 - part.start, part.len(), &x)?;
         }
         Ok(x)
@@ -127,31 +127,15 @@ impl Posterior {
         }
     }
 
-    /// Standard deviation of the noise, `[1, ...]` or shaped like the sample.
-    fn deviation<const D: usize>(&self, variance: Variance, fraction: Option<Tensor<D>>) -> Deviation<D> {
+    /// Standard normal noise brought to the posterior's deviation.
+    fn scaled<const D: usize>(&self, noise: Tensor<D>, variance: Variance, fraction: Option<Tensor<D>>) -> Tensor<D> {
         match (variance, fraction) {
             (Variance::LearnedRange, Some(fraction)) => {
                 let (small, large) = (self.variance.ln(), self.beta.ln());
-                Deviation::Tensor((fraction * (large - small) + small).mul_scalar(0.5).exp())
+                noise * (fraction * (large - small) + small).mul_scalar(0.5).exp()
             }
-            (Variance::FixedLarge, _) => Deviation::Number(self.beta.sqrt()),
-            _ => Deviation::Number(self.variance.sqrt()),
-        }
-    }
-}
-
-enum Deviation<const D: usize> {
-    Number(f64),
-    Tensor(Tensor<D>),
-}
-
-impl<const D: usize> std::ops::Mul<Deviation<D>> for Tensor<D> {
-    type Output = Self;
-
-    fn mul(self, deviation: Deviation<D>) -> Self {
-        match deviation {
-            Deviation::Number(value) => self * value,
-            Deviation::Tensor(values) => self * values,
+            (Variance::FixedLarge, _) => noise * self.beta.sqrt(),
+            _ => noise * self.variance.sqrt(),
         }
     }
 }

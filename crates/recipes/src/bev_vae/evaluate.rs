@@ -10,7 +10,7 @@ use serde::Serialize;
 use vae::BevVae;
 
 use super::MeanPictures;
-use super::viewer::{Coded, Viewer, pictures_of};
+use super::viewer::{Coded, PresentView, Viewer, pictures_of};
 use crate::sheet::Sheet;
 
 /// Mean PSNR over pictures, and what the baselines reach on the same pictures.
@@ -149,9 +149,9 @@ impl Evaluator {
 
     fn score_reconstruction(&self, viewer: &Viewer, coded: &Coded, contest: &mut Contest) {
         let decoded = viewer.decode(coded, coded.input());
-        for (view, channel, truth) in coded.present() {
-            contest.model.update(&decoded[view], truth);
-            self.score_mean(channel, 0.0, truth, contest);
+        for PresentView { view, channel, picture, counted } in coded.present() {
+            contest.model.update_where(&decoded[view], picture, counted);
+            self.score_mean(channel, 0.0, picture, counted, contest);
         }
     }
 
@@ -170,14 +170,14 @@ impl Evaluator {
         for (view, truth) in pictures_of(&truths).enumerate() {
             contest.model.update(&decoded[view], truth);
             contest.nearest.update(inputs[coded.nearest_view(view, yaw_rad)], truth);
-            self.score_mean(&coded.channels()[view], yaw_deg, truth, contest);
+            self.score_mean(&coded.channels()[view], yaw_deg, truth, truths.counted_pixels(view), contest);
         }
         Ok(())
     }
 
-    fn score_mean(&self, channel: &str, yaw_deg: f64, truth: &[f32], contest: &mut Contest) {
+    fn score_mean(&self, channel: &str, yaw_deg: f64, truth: &[f32], counted: &[bool], contest: &mut Contest) {
         if let Some(mean) = self.means.of(channel, yaw_deg) {
-            contest.mean.update(&mean, truth);
+            contest.mean.update_where(&mean, truth, counted);
         }
     }
 }

@@ -16,4 +16,4 @@ pub use experiment::{
 };
 pub use losses::Perceptual;
 pub use task::{BevVaeTask, LoaderSource};
-pub use viewer::{Coded, Viewer, pictures_of};
+pub use viewer::{Coded, PresentView, Viewer, pictures_of};

@@ -15,12 +15,13 @@ use rand_distr::{Distribution, StandardNormal};
 use train::{StepContext, StepOutput};
 use vae::losses::{
     adaptive_weight, adversarial, hinge_discriminator, last_layer_gradient_norm, masked_l2, select_views,
+    with_ignored_pixels_of,
 };
 use vae::pixels::normalise;
 use vae::{BevVae, Decoded, DiagonalGaussian, Discriminator};
 
 use super::Perceptual;
-use crate::tensors::{decode_cameras, encode_cameras, pictures, view_mask};
+use crate::tensors::{counted_pixels, decode_cameras, encode_cameras, pictures, view_mask};
 
 /// Share of the adversarial term: off, or factor on λ·L_A and the views it looks at.
 pub struct Adversary<'a> {
@@ -52,12 +53,15 @@ impl Step<'_> {
         let mut output = StepOutput::new(batch.target.mask.iter().filter(|present| **present).count());
         let stream = |purpose: &str| train::stream(ctx.seed, &format!("{purpose}/{micro}"), ctx.step);
         let (posterior, decoded) = self.forward(batch, &mut stream("posterior"));
-        let target = normalise(pictures(&batch.target, self.device));
-        let mask = view_mask(&batch.target, self.device);
+        let target = Target {
+            images: normalise(pictures(&batch.target, self.device)),
+            mask: view_mask(&batch.target, self.device),
+            counted: counted_pixels(&batch.target, self.device),
+        };
 
         let images = decoded.images.clone().inner();
         let mut views = stream("views");
-        let (reconstruction, mut upstream) = self.reconstruction_gradient(&images, &target, mask, batch, &mut views);
+        let (reconstruction, mut upstream) = self.reconstruction_gradient(&images, &target, batch, &mut views);
         let kl = posterior.kl().mean();
         output.push("loss", reconstruction + kl.clone() * self.kl_weight);
         output.push("kl", kl.clone());
@@ -67,12 +71,13 @@ impl Step<'_> {
             let positions = choose_views(&batch.target, adversary.views, &mut views);
             if adversary.weight > 0.0 {
                 let tokens = decoded.last_tokens.clone().inner();
-                let (gradient, lambda, score) = adversarial_gradient(adversary, &images, &upstream, tokens, &positions);
+                let (gradient, lambda, score) =
+                    adversarial_gradient(adversary, &images, &target, &upstream, tokens, &positions);
                 upstream = upstream + gradient * (lambda.clone() * adversary.weight).reshape([1, 1, 1, 1, 1]);
                 output.push("lambda", lambda);
                 output.push("adversarial", score);
             }
-            let (loss, gradients) = discriminator_gradients(adversary, images, target, &positions);
+            let (loss, gradients) = discriminator_gradients(adversary, images, &target, &positions);
             output.push("discriminator", loss);
             discriminator = Some(gradients);
         }
@@ -95,17 +100,16 @@ impl Step<'_> {
     fn reconstruction_gradient(
         &self,
         images: &Tensor<5>,
-        target: &Tensor<5>,
-        mask: Tensor<2, Bool>,
+        target: &Target,
         batch: &SceneBatch,
         views: &mut ChaCha8Rng,
     ) -> (Tensor<1>, Tensor<5>) {
         let leaf = Tensor::from_inner(images.clone()).require_grad();
-        let mut loss = masked_l2(leaf.clone(), target.clone(), mask);
+        let mut loss = masked_l2(leaf.clone(), target.images.clone(), target.mask.clone(), target.counted.clone());
         if let Some(perceptual) = self.perceptual {
             let positions = choose_views(&batch.target, perceptual.views(), views);
-            let decoded = select_views(leaf.clone(), &positions);
-            loss = loss + perceptual.loss(decoded, select_views(target.clone(), &positions));
+            let decoded = select_views(target.fill_ignored(leaf.clone()), &positions);
+            loss = loss + perceptual.loss(decoded, select_views(target.images.clone(), &positions));
         }
         let value = loss.clone().inner();
         let gradients = loss.backward();
@@ -114,10 +118,24 @@ impl Step<'_> {
     }
 }
 
+/// What should have been decoded, and which of it counts.
+struct Target {
+    images: Tensor<5>,
+    mask: Tensor<2, Bool>,
+    counted: Option<Tensor<5>>,
+}
+
+impl Target {
+    fn fill_ignored(&self, decoded: Tensor<5>) -> Tensor<5> {
+        with_ignored_pixels_of(decoded, &self.images, self.counted.as_ref())
+    }
+}
+
 /// Gradient of L_A at the decoded pictures, λ, and L_A.
 fn adversarial_gradient(
     adversary: &Adversary,
     images: &Tensor<5>,
+    target: &Target,
     reconstruction: &Tensor<5>,
     tokens: Tensor<4>,
     positions: &[usize],
@@ -125,7 +143,7 @@ fn adversarial_gradient(
     let [b, v, c, h, w] = images.dims();
     let leaf = Tensor::from_inner(images.clone()).require_grad();
     let frozen = adversary.discriminator.clone().no_grad();
-    let loss = adversarial(frozen.forward(select_views(leaf.clone(), positions)));
+    let loss = adversarial(frozen.forward(select_views(target.fill_ignored(leaf.clone()), positions)));
     let value = loss.clone().inner();
     let gradients = loss.backward();
     let gradient = leaf.grad(&gradients).expect("the score depends on the decoded pictures");
@@ -141,12 +159,13 @@ fn adversarial_gradient(
 fn discriminator_gradients(
     adversary: &Adversary,
     images: Tensor<5>,
-    target: Tensor<5>,
+    target: &Target,
     positions: &[usize],
 ) -> (Tensor<1>, GradientsParams) {
     let n = positions.len();
-    let fake = select_views(Tensor::from_inner(images), positions);
-    let scores = adversary.discriminator.forward(Tensor::cat(vec![select_views(target, positions), fake], 0));
+    let fake = select_views(target.fill_ignored(Tensor::from_inner(images)), positions);
+    let real = select_views(target.images.clone(), positions);
+    let scores = adversary.discriminator.forward(Tensor::cat(vec![real, fake], 0));
     let loss = hinge_discriminator(scores.clone().narrow(0, 0, n), scores.narrow(0, n, n));
     let value = loss.clone().inner();
     (value, GradientsParams::from_grads(loss.backward(), adversary.discriminator))

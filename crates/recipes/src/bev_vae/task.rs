@@ -34,6 +34,13 @@ struct AdversaryState {
     optimizer: Optimizer,
 }
 
+/// A micro batch and networks of its own to differentiate.
+struct Micro<'a> {
+    batch: &'a SceneBatch,
+    model: BevVae,
+    discriminator: Option<Discriminator>,
+}
+
 impl BevVaeTask {
     /// Fresh networks; `device` carries the tape.
     ///
@@ -92,25 +99,26 @@ impl Task for BevVaeTask {
         let begun = |share: f64| ctx.step as f64 >= share * ctx.total_steps as f64;
         let adversary = self.adversary.as_ref().filter(|state| begun(state.config.discriminator_start));
         // Sequential forks, because parameter ids and tensors are shared with the module they come from.
-        let micro = |(number, batch)| {
-            let networks = (self.fork(&self.model), adversary.map(|state| self.fork(&state.discriminator)));
-            (number, batch, networks)
+        let fork = |batch| Micro {
+            batch,
+            model: self.fork(&self.model),
+            discriminator: adversary.map(|state| self.fork(&state.discriminator)),
         };
-        let micros: Vec<(u64, &SceneBatch, (BevVae, Option<Discriminator>))> = (0..).zip(&batches).map(micro).collect();
-        let parts = in_lanes(&micros, self.experiment.device.lanes(), |_, (number, batch, (model, discriminator))| {
-            let adversary = adversary.zip(discriminator.as_ref()).map(|(state, discriminator)| Adversary {
+        let micros: Vec<Micro> = batches.iter().map(fork).collect();
+        let parts = in_lanes(&micros, self.experiment.device.lanes(), |number, micro| {
+            let adversary = adversary.zip(micro.discriminator.as_ref()).map(|(state, discriminator)| Adversary {
                 discriminator,
                 weight: if begun(state.config.generator_start) { state.config.weight } else { 0.0 },
                 views: state.config.views,
             });
             let step = Step {
-                model,
+                model: &micro.model,
                 perceptual: self.perceptual.as_ref(),
                 adversary,
                 kl_weight: self.experiment.loss.kl_weight,
                 device: &self.device,
             };
-            step.run(batch, *number, ctx)
+            step.run(micro.batch, number as u64, ctx)
         });
         let mut output = StepOutput::new(0);
         let (mut generator, mut discriminator) = (GradientMean::default(), GradientMean::default());

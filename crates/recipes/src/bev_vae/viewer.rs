@@ -93,6 +93,18 @@ impl<'a> Viewer<'a> {
     }
 }
 
+/// A camera with its clean picture.
+pub struct PresentView<'a> {
+    /// Position in the rig.
+    pub view: usize,
+    /// Its name.
+    pub channel: &'a str,
+    /// `[3, H, W]` RGB in [0, 1].
+    pub picture: &'a [f32],
+    /// `[H, W]`, false where the dataset says to ignore a pixel.
+    pub counted: &'a [bool],
+}
+
 impl Coded {
     /// The clean input cameras and pictures.
     pub fn input(&self) -> &ViewArrays {
@@ -104,12 +116,15 @@ impl Coded {
         pictures_of(&self.input)
     }
 
-    /// Channel and clean picture of each camera that has one, with its position.
-    pub fn present(&self) -> impl Iterator<Item = (usize, &str, &[f32])> {
+    /// The cameras that have a picture.
+    pub fn present(&self) -> impl Iterator<Item = PresentView<'_>> {
         let named = self.channels.iter().zip(pictures_of(&self.input)).enumerate();
-        named
-            .filter(|(view, _)| self.input.mask[*view])
-            .map(|(view, (channel, picture))| (view, channel.as_str(), picture))
+        named.filter(|(view, _)| self.input.mask[*view]).map(|(view, (channel, picture))| PresentView {
+            view,
+            channel,
+            picture,
+            counted: self.input.counted_pixels(view),
+        })
     }
 
     /// Channel of each camera.

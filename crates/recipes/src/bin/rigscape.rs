@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, check_data, info, make_data, novel_view,
-    reconstruct, run_main,
+    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, ShowDataArgs, check_data, info, make_data,
+    novel_view, reconstruct, run_main, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -20,6 +20,7 @@ struct Cli {
 enum Command {
     MakeData(MakeDataArgs),
     CheckData(CheckDataArgs),
+    ShowData(ShowDataArgs),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
@@ -30,6 +31,7 @@ fn main() -> ExitCode {
     run_main(|| match &cli.command {
         Command::MakeData(args) => make_data(args),
         Command::CheckData(args) => check_data(args),
+        Command::ShowData(args) => show_data(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),

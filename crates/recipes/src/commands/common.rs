@@ -28,8 +28,27 @@ pub fn run_main(command: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
         Err(error) => {
             // The reader of the message may be gone (a closed pipe); there is nobody left to tell.
             let _ = writeln!(std::io::stderr(), "error: {error:#}");
-            ExitCode::FAILURE
+            if error.is::<UsageError>() { ExitCode::from(USAGE_EXIT) } else { ExitCode::FAILURE }
         }
+    }
+}
+
+/// What the option parser exits with, too.
+const USAGE_EXIT: u8 = 2;
+
+/// A command that was asked for something that makes no sense, in options or config files. Exit code 2 instead of 1.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct UsageError(String);
+
+impl UsageError {
+    pub(super) fn of(text: impl Into<String>) -> anyhow::Error {
+        Self(text.into()).into()
+    }
+
+    /// The whole chain of causes as the complaint.
+    pub(super) fn wrap(error: anyhow::Error) -> anyhow::Error {
+        Self::of(format!("{error:#}"))
     }
 }
 

@@ -1,17 +1,23 @@
 //! What the binaries do, one file per subcommand.
 
 mod check_data;
+mod check_table;
 mod common;
+mod data_source;
 mod info;
 mod make_data;
 mod novel_view;
 mod reconstruct;
+mod show_data;
 mod train_vae;
 
 pub use check_data::{CheckDataArgs, check_data};
-pub use common::{DataArgs, LoadedModel, run_main};
+pub(crate) use check_table::class_name;
+pub use common::{DataArgs, LoadedModel, UsageError, run_main};
+pub use data_source::{Chosen, DataSource, Named};
 pub use info::{InfoArgs, info};
 pub use make_data::{MakeDataArgs, make_data};
 pub use novel_view::{NovelViewArgs, novel_view};
 pub use reconstruct::{ReconstructArgs, reconstruct};
+pub use show_data::{ShowDataArgs, show_data};
 pub use train_vae::{TrainVaeArgs, train_vae};

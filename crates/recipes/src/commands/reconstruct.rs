@@ -6,7 +6,7 @@ use clap::Parser;
 use train::DeviceConfig;
 
 use super::common::{DataArgs, LoadedModel, say};
-use crate::bev_vae::Viewer;
+use crate::bev_vae::{PresentView, Viewer};
 use crate::sheet::Sheet;
 
 /// Encode frames of a dataset and decode the same cameras: input over reconstruction, one pair of rows per frame
@@ -42,8 +42,8 @@ pub fn reconstruct(args: &ReconstructArgs) -> anyhow::Result<()> {
     for frame in viewer.frames(&loaded.datasets(&args.data)?, args.frames) {
         let coded = viewer.encode(&frame?)?;
         let decoded = viewer.decode(&coded, coded.input());
-        for (view, _, truth) in coded.present() {
-            psnr.update(&decoded[view], truth);
+        for PresentView { view, picture, counted, .. } in coded.present() {
+            psnr.update_where(&decoded[view], picture, counted);
         }
         sheet.row(coded.pictures());
         sheet.row(decoded.iter().map(Vec::as_slice));

@@ -8,7 +8,7 @@ use geometry::{CameraRig, ImageEdit, RigPreset, Rigid};
 use nn::Init;
 use nn::golden::{golden_stream, golden_values};
 use nn::weights::fill_params;
-use vae::losses::{adaptive_weight, adversarial, last_layer_gradient_norm, masked_l2};
+use vae::losses::{adaptive_weight, adversarial, last_layer_gradient_norm, masked_l2, with_ignored_pixels_of};
 use vae::sample_points::{rays_in_grid, voxels_in_views};
 use vae::scene_decoder::depth_weights;
 use vae::{BevVae, BevVaeConfig, Discriminator, Preset, ViewMatrices};
@@ -171,7 +171,7 @@ fn the_adaptive_weight_scheme_equals_the_single_graph() {
     let (kl, decoded) = forward();
     let images = decoded.images.clone().inner();
     let leaf = Tensor::from_inner(images.clone()).require_grad();
-    let g_rec = leaf.grad(&masked_l2(leaf.clone(), target.clone(), mask.clone()).backward()).unwrap();
+    let g_rec = leaf.grad(&masked_l2(leaf.clone(), target.clone(), mask.clone(), None).backward()).unwrap();
     let leaf = Tensor::from_inner(images).require_grad();
     let score = adversarial(discriminator.clone().no_grad().forward(leaf.clone().reshape([v, 3, h, w])));
     let g_adv = leaf.grad(&score.backward()).unwrap();
@@ -185,7 +185,7 @@ fn the_adaptive_weight_scheme_equals_the_single_graph() {
 
     let (kl, decoded) = forward();
     let score = adversarial(discriminator.no_grad().forward(decoded.images.clone().reshape([v, 3, h, w])));
-    let total = masked_l2(decoded.images, target, mask) + score * f64::from(lambda) * 0.1 + kl;
+    let total = masked_l2(decoded.images, target, mask, None) + score * f64::from(lambda) * 0.1 + kl;
     let single = GradientsParams::from_grads(total.backward(), &model);
 
     let last = model.decoder.image.pixels.weight.id;
@@ -246,4 +246,24 @@ fn the_discriminator_refuses_sizes_it_cannot_halve() {
     // No statistics across the batch: each picture's score is its own.
     let one = network.forward(noise("pictures", [3, 3, 32, 64], &device).narrow(0, 1, 1));
     assert_same(scores.narrow(0, 1, 1), one, "score of one picture");
+}
+
+#[test]
+fn ignored_pixels_and_absent_views_do_not_enter_the_losses() {
+    let device = device();
+    let values = |f: fn(usize) -> f32| {
+        let all: Vec<f32> = (0..2 * 3 * 4).map(f).collect();
+        Tensor::<5>::from_data(TensorData::new(all, [1, 2, 3, 2, 2]), &device)
+    };
+    let (decoded, target) = (values(|i| if i % 4 == 1 { 100.0 } else { 0.5 }), values(|_| 0.0));
+    let counted = Tensor::<5>::from_data(TensorData::new([1.0f32, 0.0, 1.0, 1.0].repeat(2), [1, 2, 1, 2, 2]), &device);
+    let mask = |second: bool| Tensor::<2, Bool>::from_data(TensorData::new(vec![true, second], [1, 2]), &device);
+    let loss = |mask, counted| masked_l2(decoded.clone(), target.clone(), mask, counted).into_scalar::<f32>();
+    assert_eq!(loss(mask(true), Some(counted.clone())), 0.25);
+    assert_eq!(loss(mask(false), Some(counted.clone())), 0.25);
+    assert!(loss(mask(true), None) > 1000.0);
+    // A view without any pixel that counts has no error.
+    assert_eq!(loss(mask(true), Some(counted.zeros_like())), 0.0);
+    let filled = with_ignored_pixels_of(decoded.clone(), &target, Some(&counted));
+    assert_eq!(filled.max().into_scalar::<f32>(), 0.5);
 }
