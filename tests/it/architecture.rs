@@ -12,7 +12,7 @@ const ARROWS: [(&str, &[&str]); 12] = [
     ("ops", &[]),
     ("nn", &["ops"]),
     ("diffusion", &[]),
-    ("features", &["nn"]),
+    ("features", &["nn", "ops"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
     ("stable-diffusion", &["nn", "ops"]),
     ("metrics", &["features"]),

@@ -8,7 +8,7 @@ mod file;
 mod params;
 
 pub use error::{Mismatch, WeightError};
-pub use file::{WeightFile, write_safetensors};
+pub use file::{WeightFile, write_safetensors, write_text};
 pub use params::{fill_params, fill_some_params, load_strict, named_params, param_shapes};
 
 /// A tensor on the host, row-major.

@@ -2,8 +2,8 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::module::{conv2d, interpolate};
-use burn::tensor::ops::{ConvOptions, InterpolateMode, InterpolateOptions, PadMode};
+use burn::tensor::module::interpolate;
+use burn::tensor::ops::{InterpolateMode, InterpolateOptions, PadMode};
 use nn::Init;
 use nn::lora::Adapters;
 
@@ -50,11 +50,11 @@ impl Conv2d {
     /// - x: `[N, in, H, W]`
     /// - output: `[N, out, H', W']`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let options = ConvOptions::new([self.stride; 2], [self.padding; 2], [1, 1], 1);
+        let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
         let [_, _, height, width] = self.weight.dims();
         let kernel = self.lora.kernel(&self.weight);
-        let base = |x| conv2d(x, kernel, Some(self.bias.val()), options.clone());
-        self.lora.add_to_conv2d(x, [height, width], &options, base)
+        let base = |x| ops::conv2d(x, kernel, Some(self.bias.val()), stride, padding);
+        self.lora.add_to_conv2d(x, ([height, width], stride, padding), base)
     }
 }
 

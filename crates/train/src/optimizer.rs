@@ -37,6 +37,34 @@ pub struct OptimizerConfig {
     pub gradient_clip: GradientClip,
     /// Learning rate over the steps.
     pub schedule: Schedule,
+    /// Factors on the learning rate by the start of a parameter's path, such as `"encoder.scene" = 3.0`; the longest match wins, 1 without
+    /// any. Narrow layers bear larger steps than wide ones.
+    pub learning_rate_factors: BTreeMap<String, f64>,
+}
+
+impl OptimizerConfig {
+    /// # Errors
+    /// [`TrainError::Config`] for a factor that is no finite number from 0, or for a path that no parameter of `module` has.
+    pub fn check<M: Module>(&self, module: &M) -> Result<(), TrainError> {
+        let parameters = list_parameters(module);
+        for (prefix, &factor) in &self.learning_rate_factors {
+            let known = parameters.iter().any(|info| is_within(&info.path, prefix));
+            if !known {
+                let why = format!("learning_rate_factors: no parameter's path starts with {prefix:?}");
+                return Err(TrainError::Config(why));
+            }
+            if !factor.is_finite() || factor < 0.0 {
+                let why = format!("learning_rate_factors.{prefix:?} = {factor}: needs a finite number from 0");
+                return Err(TrainError::Config(why));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether `path` is `prefix` or lies below it: `a.b.c` is within `a.b`, `a.bc` is not.
+fn is_within(path: &str, prefix: &str) -> bool {
+    path.strip_prefix(prefix).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
 impl Default for OptimizerConfig {
@@ -49,6 +77,7 @@ impl Default for OptimizerConfig {
             decay_scope: DecayScope::default(),
             gradient_clip: GradientClip::default(),
             schedule: Schedule::default(),
+            learning_rate_factors: BTreeMap::new(),
         }
     }
 }
@@ -101,6 +130,7 @@ pub struct AdamW {
     eps: f64,
     weight_decay: f64,
     scope: DecayScope,
+    learning_rate_factors: BTreeMap<String, f64>,
     state: BTreeMap<String, Moments>,
 }
 
@@ -112,6 +142,7 @@ impl AdamW {
             eps: config.eps,
             weight_decay: config.weight_decay,
             scope: config.decay_scope.clone(),
+            learning_rate_factors: config.learning_rate_factors.clone(),
             state: BTreeMap::new(),
         }
     }
@@ -121,7 +152,15 @@ impl AdamW {
     /// counts the updates of that parameter from 1.
     #[must_use]
     pub fn step<M: Module>(&mut self, module: M, grads: &mut GradientsParams, learning_rate: f64) -> M {
-        map_with_gradients(module, grads, |info, values, grad| self.update(info, values, grad, learning_rate))
+        map_with_gradients(module, grads, |info, values, grad| {
+            self.update(info, values, grad, learning_rate * self.factor(&info.path))
+        })
+    }
+
+    /// Factor on the learning rate of the parameter at `path`.
+    fn factor(&self, path: &str) -> f64 {
+        let matching = self.learning_rate_factors.iter().filter(|(prefix, _)| is_within(path, prefix));
+        matching.max_by_key(|(prefix, _)| prefix.len()).map_or(1.0, |(_, &factor)| factor)
     }
 
     fn update(&mut self, info: &ParamInfo, values: Tensor<1>, grad: Tensor<1>, learning_rate: f64) -> Tensor<1> {

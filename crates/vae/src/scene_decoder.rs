@@ -61,7 +61,7 @@ impl RayAttention {
         let [_, s, _] = values.dims();
         let (m, p) = (self.heads, self.points);
         let offsets = self.offset.forward(query.clone()).reshape([b, v * n, m, LEVELS, p, 3]);
-        let weights = softmax(self.weight.forward(query.clone()).reshape([b, v, n, m, LEVELS * p]), 4);
+        let weights = ops::softmax(self.weight.forward(query.clone()).reshape([b, v, n, m, LEVELS * p]));
         let gathered = ops::deformable_rays_3d(
             values.reshape([b, s, m, c / m]),
             levels,

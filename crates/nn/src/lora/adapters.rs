@@ -2,8 +2,6 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::module::conv2d;
-use burn::tensor::ops::ConvOptions;
 
 /// One adapter of one weight: `y += weight · alpha / rank · B (A x)`.
 #[derive(Module, Debug)]
@@ -118,16 +116,16 @@ impl Adapters {
         let y = base(x.clone());
         let (mut dims, rows) = (y.dims(), x.flatten_to_rows());
         let sum = self.acting().map(|adapter| {
-            let low = rows.clone().matmul(adapter.down.val().transpose()) * adapter.scale();
-            low.matmul(adapter.up.val().transpose())
+            let low = ops::linear(rows.clone(), adapter.down.val(), None) * adapter.scale();
+            ops::linear(low, adapter.up.val(), None)
         });
         let Some(added) = sum.reduce(|a, b| a + b) else { return y };
         dims[D - 1] = added.dims()[1];
         y + added.reshape(dims)
     }
 
-    /// As [`Adapters::add_to_rows`] for an ungrouped convolution with this kernel size and these options: A is a
-    /// convolution of the same kind to `rank` channels, B a 1×1 convolution.
+    /// As [`Adapters::add_to_rows`] for a convolution with this kernel size, stride and padding: A is a convolution of the same kind
+    /// to `rank` channels, B a 1×1 convolution.
     ///
     /// # Shapes
     /// - x: `[B, in, H, W]`
@@ -135,22 +133,20 @@ impl Adapters {
     pub fn add_to_conv2d(
         &self,
         x: Tensor<4>,
-        kernel: [usize; 2],
-        options: &ConvOptions<2>,
+        (kernel, stride, padding): ([usize; 2], [usize; 2], [usize; 2]),
         base: impl FnOnce(Tensor<4>) -> Tensor<4>,
     ) -> Tensor<4> {
         if self.acting().next().is_none() {
             return base(x);
         }
-        assert_eq!(options.groups, 1, "adapters of a grouped convolution");
         let y = base(x.clone());
         let channels = x.dims()[1];
         self.acting().fold(y, |y, adapter| {
             let (rank, out) = (adapter.rank(), adapter.up.lazy_shape()[0]);
             let down = adapter.down.val().reshape([rank, channels, kernel[0], kernel[1]]);
-            let low = conv2d(x.clone(), down, None, options.clone()) * adapter.scale();
+            let low = ops::conv2d(x.clone(), down, None, stride, padding) * adapter.scale();
             let up = adapter.up.val().reshape([out, rank, 1, 1]);
-            y + conv2d(low, up, None, ConvOptions::new([1, 1], [0, 0], [1, 1], 1))
+            y + ops::conv2d(low, up, None, [1; 2], [0; 2])
         })
     }
 

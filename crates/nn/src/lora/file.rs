@@ -9,7 +9,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::keys::{Key, Part, read_key};
 use super::settings::{self, Settings, Written};
 use super::{LoraError, LoraSites, LowRank, check_known, check_new, for_each_site, push};
-use crate::weights::{HostTensor, Mismatch, WeightError, WeightFile, write_safetensors};
+use crate::weights::{HostTensor, Mismatch, WeightError, WeightFile, write_safetensors, write_text};
 
 pub use super::keys::LoraLayout;
 
@@ -49,7 +49,7 @@ pub fn save<M: LoraSites + Clone>(
     notes.insert("format".to_owned(), "pt".to_owned());
     if layout == LoraLayout::PeftWholeModel {
         let beside = path.with_file_name(settings::CONFIG_FILE);
-        std::fs::write(&beside, settings::config_text(&written))
+        write_text(&beside, &settings::config_text(&written))
             .map_err(|source| WeightError::Io { source, path: beside })?;
     } else {
         notes.extend([settings::header_entry(component, &written)]);

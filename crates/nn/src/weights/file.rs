@@ -178,6 +178,18 @@ pub fn write_safetensors(
     })
 }
 
+/// Writes a text that belongs to weights. The file appears under its name only when it is complete.
+///
+/// # Errors
+/// What the operating system says.
+pub fn write_text(path: &Path, text: &str) -> std::io::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    std::fs::write(&part, text)?;
+    std::fs::rename(&part, path)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

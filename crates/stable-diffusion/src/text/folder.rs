@@ -5,15 +5,14 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use nn::Init;
-use nn::weights::{
-    HostTensor, Mismatch, WeightError, WeightFile, fill_params, named_params, param_shapes, write_safetensors,
-};
+use nn::weights::{HostTensor, Mismatch, WeightError, WeightFile, write_safetensors, write_text};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::names::{Stored, our_names};
 use super::{Activation, BytePairs, ClipTextConfig, ClipTextModel, ClipTokenizer, Padding};
 use super::{TextCleaning, TextError, TextOutput};
+use crate::layout::{fill_by_state_dict_name, state_dict_params, state_dict_shapes};
 
 /// Files that may hold the weights, in order of preference.
 const WEIGHT_FILES: [&str; 2] = ["model.safetensors", "model.fp16.safetensors"];
@@ -132,16 +131,15 @@ fn read_config(path: &Path) -> Result<ClipTextConfig, TextError> {
 /// [`WeightError::Mismatch`] with every missing, unexpected and wrongly shaped name, or what reading gives.
 pub fn load_text_weights(model: ClipTextModel, file: &WeightFile) -> Result<ClipTextModel, WeightError> {
     let names = our_names(file, model.config().num_hidden_layers);
-    let wanted = param_shapes(&model).into_iter().collect();
+    let wanted = state_dict_shapes(&model).into_iter().collect();
     let found = names.iter().map(|(ours, stored)| (ours.clone(), stored_shape(file, stored))).collect();
     let mismatch = Mismatch::between(&wanted, &found);
     if !mismatch.is_empty() {
         return Err(WeightError::Mismatch(Box::new(mismatch)).in_file(file.path()));
     }
-    fill_params(model, |name, _| {
-        let missing = || WeightError::MissingTensor { name: name.to_owned(), path: file.path().to_path_buf() };
-        let stored = names.get(name).ok_or_else(missing)?;
-        Ok(part(file.tensor(&stored.name)?, stored.third))
+    fill_by_state_dict_name(model, |name, _| match names.get(name) {
+        Some(stored) => Ok(Some(part(file.tensor(&stored.name)?, stored.third))),
+        None => Ok(None),
     })
 }
 
@@ -192,7 +190,7 @@ pub fn save_clip(root: &Path, tokenizer: &ClipTokenizer, model: &ClipTextModel) 
     let folder = create(root.join(TEXT_ENCODER))?;
     // Readers of other houses ask for this entry.
     let metadata = BTreeMap::from([("format".to_owned(), "pt".to_owned())]);
-    write_safetensors(folder.join(WEIGHT_FILES[0]), &named_params(model)?, &metadata)?;
+    write_safetensors(folder.join(WEIGHT_FILES[0]), &state_dict_params(model)?, &metadata)?;
     let config = serde_json::to_value(model.config()).map_err(|error| TextError::Sizes(error.to_string()))?;
     let config = with_class(config);
     write(&folder.join("config.json"), &format!("{config:#}\n"))
@@ -216,7 +214,7 @@ fn create(folder: PathBuf) -> Result<PathBuf, TextError> {
 }
 
 fn write(path: &Path, text: &str) -> Result<(), TextError> {
-    std::fs::write(path, text).map_err(|source| TextError::Io { source, path: path.to_path_buf() })
+    write_text(path, text).map_err(|source| TextError::Io { source, path: path.to_path_buf() })
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, TextError> {

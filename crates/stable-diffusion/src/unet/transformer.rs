@@ -40,11 +40,8 @@ impl Projection {
         match self {
             Self::Linear(linear) => linear.forward(tokens),
             Self::Convolution(conv) => {
-                let [n, positions, width] = tokens.dims();
-                let matrix = conv.lora.matrix(&conv.weight).transpose();
-                let base = |rows: Tensor<2>| rows.matmul(matrix) + conv.bias.val().unsqueeze::<2>();
-                let y = conv.lora.add_to_rows(tokens.reshape([n * positions, width]), base);
-                y.reshape([n, positions, width])
+                let matrix = conv.lora.matrix(&conv.weight);
+                conv.lora.add_to_rows(tokens, |tokens| ops::linear(tokens, matrix, Some(conv.bias.val())))
             }
         }
     }

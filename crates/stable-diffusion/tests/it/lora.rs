@@ -5,8 +5,8 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use nn::Init;
 use nn::lora::{self, LoraSites};
-use stable_diffusion::UNet2DCondition;
 use nn::weights::WeightFile;
+use stable_diffusion::UNet2DCondition;
 use stable_diffusion::layout::{
     Network, WEIGHTS_FILE, load_folder, load_weights, save_folder, state_dict_params, state_dict_shapes,
 };

@@ -9,9 +9,10 @@ use nn::weights::{HostTensor, WeightError, WeightFile, named_params, write_safet
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, serialize_to_file};
 use serde_json::{Value, json};
+use stable_diffusion::layout::single_file::save_single_file;
 use stable_diffusion::text::{
     Activation, ClipTextConfig, ClipTextModel, ClipTokenizer, Padding, TextCleaning, TextError, TextOutput, TokenBatch,
-    load_clip, load_text_encoder, load_text_weights, save_clip,
+    load_clip, load_text_encoder, load_text_weights, save_clip, text_single_file_tensors,
 };
 
 use super::reference::{device, golden_weights, table, values, write_folder};
@@ -210,4 +211,20 @@ fn a_saved_folder_comes_back_bit_for_bit() {
     save_clip(root.path(), &ClipTokenizer::new(pairs, TextCleaning::Transformers, Padding::Zero), &small).unwrap();
     let error = load_clip(root.path(), &device()).unwrap_err();
     assert!(matches!(error, TextError::Format { .. }) && error.to_string().contains("49408 tokens"), "{error}");
+}
+
+#[test]
+fn single_files_hold_the_encoder_in_both_styles() {
+    for hidden_act in [Activation::QuickGelu, Activation::Gelu] {
+        let config = ClipTextConfig { hidden_act, ..small_config() };
+        let model = ClipTextModel::new(&config, &mut Init::new(3, &device()));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("single.safetensors");
+        save_single_file(&path, &text_single_file_tensors(&model).unwrap()).unwrap();
+        let file = WeightFile::open(&path).unwrap();
+        let fused = "cond_stage_model.model.transformer.resblocks.1.attn.in_proj_weight";
+        assert_eq!(file.shape(fused).is_some(), hidden_act == Activation::Gelu);
+        let again = load_text_weights(ClipTextModel::new(&config, &mut Init::new(4, &device())), &file).unwrap();
+        assert_eq!(states(&again), states(&model));
+    }
 }
