@@ -7,6 +7,7 @@ mod linear;
 pub mod lora;
 mod norm;
 mod position;
+pub mod segments;
 mod transformer;
 pub mod weights;
 

@@ -3,3 +3,4 @@
 mod lora;
 mod lora_files;
 mod lora_golden;
+mod segments;
