@@ -18,7 +18,22 @@ const ARROWS: [(&str, &[&str]); 13] = [
     ("stable-diffusion", &["nn", "ops"]),
     ("metrics", &["features"]),
     ("train", &[]),
-    ("rigscape", &["geometry", "world", "data", "ops", "nn", "features", "vae", "metrics", "train"]),
+    (
+        "rigscape",
+        &[
+            "geometry",
+            "world",
+            "data",
+            "ops",
+            "nn",
+            "diffusion",
+            "features",
+            "vae",
+            "stable-diffusion",
+            "metrics",
+            "train",
+        ],
+    ),
 ];
 
 fn root() -> PathBuf {

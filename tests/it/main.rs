@@ -3,5 +3,6 @@
 mod architecture;
 mod configs;
 mod data_commands;
+mod latent_runs;
 mod programs;
 mod runs;

@@ -7,6 +7,7 @@ use burn::tensor::Tensor;
 
 use crate::Init;
 use crate::layout::{blocks_from_volume, image_from_patches, patches_from_image};
+use crate::lora::Adapters;
 
 /// `y = x Wᵀ + b` over the last axis.
 #[derive(Module, Debug)]
@@ -15,6 +16,8 @@ pub struct Linear {
     pub weight: Param<Tensor<2>>,
     /// `[out]`
     pub bias: Option<Param<Tensor<1>>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 /// Whether an affine layer adds a learned offset.
@@ -36,25 +39,27 @@ impl Linear {
     /// Weights and bias U(±1/√in).
     pub fn new(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
         let bound = 1.0 / (d_in as f64).sqrt();
-        Self { weight: init.uniform([d_out, d_in], bound), bias: bias.init(d_out, bound, init) }
+        let weight = init.uniform([d_out, d_in], bound);
+        Self { weight, bias: bias.init(d_out, bound, init), lora: Adapters::none() }
     }
 
     /// Weights and bias 0: the last layer of a residual branch that starts as the identity.
     pub fn zeros(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
         let bias = (bias == Bias::With).then(|| init.constant([d_out], 0.0));
-        Self { weight: init.constant([d_out, d_in], 0.0), bias }
+        Self { weight: init.constant([d_out, d_in], 0.0), bias, lora: Adapters::none() }
     }
 
     /// Passes its input through unchanged at the start; no bias.
     pub fn identity(width: usize, init: &mut Init) -> Self {
-        Self { weight: init.diagonal(width), bias: None }
+        Self { weight: init.diagonal(width), bias: None, lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - x: `[.., in]`
     /// - output: `[.., out]`
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::linear(x, self.weight.val(), self.bias.as_ref().map(Param::val))
+        let matrix = self.lora.matrix(&self.weight);
+        self.lora.add_to_rows(x, |x| ops::linear(x, matrix, self.bias.as_ref().map(Param::val)))
     }
 }
 
@@ -65,22 +70,25 @@ pub struct PatchConv2d {
     pub weight: Param<Tensor<4>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 impl PatchConv2d {
     /// U(±1/√fan_in), fan_in = in·k².
     pub fn new(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
         let bound = 1.0 / ((c_in * patch * patch) as f64).sqrt();
-        Self { weight: init.uniform([c_out, c_in, patch, patch], bound), bias: init.uniform([c_out], bound) }
+        let weight = init.uniform([c_out, c_in, patch, patch], bound);
+        Self { weight, bias: init.uniform([c_out], bound), lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - image: `[B, in, h·k, w·k]`
     /// - output: `[B, h, w, out]`, channels last
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
-        let weight = self.weight.val();
-        let [c_out, c_in, k, _] = weight.dims();
-        ops::linear(patches_from_image(image, k), weight.reshape([c_out, c_in * k * k]), Some(self.bias.val()))
+        let k = self.weight.dims()[3];
+        let matrix = self.lora.matrix(&self.weight);
+        self.lora.add_to_rows(patches_from_image(image, k), |x| ops::linear(x, matrix, Some(self.bias.val())))
     }
 }
 
@@ -149,20 +157,25 @@ pub struct Conv3x3 {
     pub weight: Param<Tensor<4>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 impl Conv3x3 {
     /// U(±1/√(9·in)).
     pub fn new(c_in: usize, c_out: usize, init: &mut Init) -> Self {
         let bound = 1.0 / ((c_in * 9) as f64).sqrt();
-        Self { weight: init.uniform([c_out, c_in, 3, 3], bound), bias: init.uniform([c_out], bound) }
+        let weight = init.uniform([c_out, c_in, 3, 3], bound);
+        Self { weight, bias: init.uniform([c_out], bound), lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - image: `[B, in, H, W]`
     /// - output: `[B, out, H, W]`
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
-        ops::conv2d(image, self.weight.val(), Some(self.bias.val()), [1; 2], [1; 2])
+        let kernel = self.lora.kernel(&self.weight);
+        let base = |image| ops::conv2d(image, kernel, Some(self.bias.val()), [1; 2], [1; 2]);
+        self.lora.add_to_conv2d(image, ([3; 2], [1; 2], [1; 2]), base)
     }
 }
 

@@ -11,7 +11,7 @@ mod safetensors_file;
 mod torch;
 
 pub use error::{Mismatch, TorchFault, WeightError};
-pub use file::WeightFile;
+pub use file::{WeightFile, write_text};
 pub use params::{fill_params, fill_some_params, load_strict, named_params, param_shapes};
 pub use safetensors_file::write_safetensors;
 

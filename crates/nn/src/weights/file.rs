@@ -200,6 +200,18 @@ fn gather<T: Copy>(values: &[T], shape: &[usize], strides: &[usize]) -> Vec<T> {
     places.into_iter().filter_map(|place| values.get(place).copied()).collect()
 }
 
+/// Writes a text that belongs to weights. The file appears under its name only when it is complete.
+///
+/// # Errors
+/// What the operating system says.
+pub fn write_text(path: &Path, text: &str) -> std::io::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    std::fs::write(&part, text)?;
+    std::fs::rename(&part, path)
+}
+
 #[cfg(test)]
 mod tests {
     use std::path::PathBuf;

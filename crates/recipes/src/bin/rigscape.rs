@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, ShowDataArgs, check_data, info, make_data,
-    novel_view, reconstruct, run_main, show_data,
+    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs, ShowDataArgs, check_data, info,
+    make_data, novel_view, reconstruct, run_main, sample, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -24,6 +24,7 @@ enum Command {
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
+    Sample(SampleArgs),
 }
 
 fn main() -> ExitCode {
@@ -35,5 +36,6 @@ fn main() -> ExitCode {
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),
+        Command::Sample(args) => sample(args),
     })
 }
