@@ -3,5 +3,7 @@
 mod architecture;
 mod configs;
 mod data_commands;
+mod evaluate;
 mod programs;
 mod runs;
+mod sensitivity;

@@ -5,6 +5,7 @@
 pub mod bev_vae;
 pub mod commands;
 pub mod config_file;
+pub mod evaluate;
 mod model_choice;
 pub mod sheet;
 pub mod show;
