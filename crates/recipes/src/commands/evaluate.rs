@@ -1,26 +1,27 @@
 //! `rigscape evaluate`: pictures against pictures, every number with its protocol.
 
+mod sides;
+mod statistics;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Instant as Clock;
 
 use anyhow::{Context, bail};
 use clap::Parser;
+use data::DatasetConfig;
 use data::nuscenes::NuScenes;
-use data::{DatasetConfig, SceneDataset};
+use metrics::Protocol;
 use metrics::detection::DetectionResults;
-use metrics::{FrameRule, Protocol};
-use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use train::{DeviceConfig, head_commit};
 
+use self::sides::{Sides, model, painted, stored};
+use self::statistics::{replaced, save_statistics};
 use super::common::{DataArgs, LoadedModel, UsageError, say};
-use crate::bev_vae::Viewer;
-use crate::config_file;
 use crate::evaluate::{
-    DatasetPictures, FeatureStream, Folder, NetworkFolder, Painted, Pass, PassOptions, PictureSource, Replaced, Report,
-    SavedStatistics, Side, detection_markdown, detection_score, draw_report, numbers, write_atomically,
+    NetworkFolder, Pass, PassOptions, PictureSource, Report, ScalarMetric, Side, detection_markdown, detection_score,
+    draw_report, numbers, write_file,
 };
 use crate::sheet::save_picture;
 
@@ -111,9 +112,6 @@ const PAIR_DEFAULTS: [&str; 3] = ["psnr/bev-vae", "ssim/skimage7", "ssim/gauss11
 /// Protocol of sets that any folder fits.
 const SET_DEFAULT: &str = "fid/plain";
 
-/// Both sides as they are read.
-type Sides<'a> = (Option<Box<dyn PictureSource + 'a>>, Box<dyn PictureSource + 'a>);
-
 /// Runs the command.
 ///
 /// # Errors
@@ -157,7 +155,7 @@ fn detections(args: &EvaluateArgs, path: &Path) -> anyhow::Result<()> {
     say(detection_markdown(&score))?;
     let Some(out) = &args.out else { return Ok(()) };
     let report = serde_json::json!({ "code": code_version(), "protocol": "nds/detection_cvpr_2019", "split": config.split, "score": score });
-    write_atomically(&out.join("detections.json"), serde_json::to_string_pretty(&report)?.as_bytes())
+    write_file(&out.join("detections.json"), serde_json::to_string_pretty(&report)?.as_bytes())
 }
 
 fn known_protocols(args: &EvaluateArgs) -> anyhow::Result<Vec<Protocol>> {
@@ -205,62 +203,11 @@ fn chosen(args: &EvaluateArgs, known: &[Protocol], has_weights: bool) -> anyhow:
 }
 
 fn needs_pairs(protocol: &Protocol) -> bool {
-    crate::evaluate::ScalarMetric::of(protocol, 0).is_some()
+    ScalarMetric::of(protocol, 0).is_some()
 }
 
 fn has_real(args: &EvaluateArgs) -> bool {
     args.checkpoint.is_some() || args.real.is_some() || args.real_data.is_some()
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct DataFile {
-    data: Vec<DatasetConfig>,
-}
-
-fn one_dataset(path: &Path) -> anyhow::Result<Arc<dyn SceneDataset>> {
-    match config_file::load::<DataFile>(path, &[])?.data.as_slice() {
-        [one] => Ok(data::open(one)?),
-        several => {
-            bail!(UsageError::of(format!("{} datasets where one is compared: {}", several.len(), path.display())))
-        }
-    }
-}
-
-fn stored(args: &EvaluateArgs) -> anyhow::Result<Sides<'static>> {
-    let side = |folder: &Option<PathBuf>, data: &Option<PathBuf>| -> anyhow::Result<Option<Box<dyn PictureSource>>> {
-        Ok(match (folder, data) {
-            (Some(folder), _) => Some(Box::new(Folder::open(folder)?)),
-            (None, Some(file)) => Some(Box::new(DatasetPictures::new(one_dataset(file)?, args.frames))),
-            (None, None) => None,
-        })
-    };
-    let real = side(&args.real, &args.real_data)?;
-    let Some(generated) = side(&args.generated, &args.generated_data)? else {
-        return Err(UsageError::of("say what is measured: --generated DIR, --generated-data FILE or --checkpoint DIR"));
-    };
-    if real.is_none() && args.real_stats.is_none() && args.save_stats.is_none() {
-        return Err(UsageError::of("say what it is compared with: --real DIR, --real-data FILE or --real-stats FILE"));
-    }
-    Ok((real, generated))
-}
-
-fn painted<'a>(loaded: &'a LoadedModel, dataset: &Arc<dyn SceneDataset>, frames: usize) -> Sides<'a> {
-    let viewer = || Viewer::new(&loaded.experiment, &loaded.model, &loaded.device);
-    let most = if frames == 0 { usize::MAX } else { frames };
-    let frames: Vec<usize> = dataset.scene_ranges().into_iter().flat_map(|range| range.take(most)).collect();
-    let size = loaded.experiment.image_size();
-    let side = |decoded| Box::new(Painted::new(viewer(), Arc::clone(dataset), frames.clone(), size, decoded));
-    (Some(side(false)), side(true))
-}
-
-fn model(path: &Path) -> BTreeMap<String, String> {
-    let entries = [
-        ("checkpoint", path.display().to_string()),
-        ("weights", "averaged (EMA)".to_owned()),
-        ("painted by", "posterior mean of the same cameras".to_owned()),
-    ];
-    entries.map(|(key, value)| (key.to_owned(), value)).into()
 }
 
 fn run(
@@ -312,8 +259,8 @@ fn run(
     };
     say(report.markdown())?;
     let Some(out) = &args.out else { return Ok(()) };
-    write_atomically(&out.join("report.json"), serde_json::to_string_pretty(&report)?.as_bytes())?;
-    write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
+    write_file(&out.join("report.json"), serde_json::to_string_pretty(&report)?.as_bytes())?;
+    write_file(&out.join("report.md"), report.markdown().as_bytes())?;
     let sides = real.as_ref().filter(|_| !args.unpaired).map(|real| (&**real, &*generated));
     save_picture(&draw_report(&report, &pass.scalars, sides)?, &out.join("report.png"))
 }
@@ -334,55 +281,4 @@ fn list_hash(source: &dyn PictureSource) -> anyhow::Result<String> {
         hash.update([0]);
     }
     Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
-}
-
-/// The one network whose statistics a file can hold.
-fn only_stream(pass: &Pass) -> anyhow::Result<&FeatureStream> {
-    match pass.streams.as_slice() {
-        [one] => Ok(one),
-        [] => Err(UsageError::of("no chosen protocol has features; choose one with --protocol, for example fid/plain")),
-        _ => Err(UsageError::of("a statistics file holds one kind of features; choose one protocol with --protocol")),
-    }
-}
-
-fn belongs_to(stream: &FeatureStream, args: &EvaluateArgs) -> BTreeMap<String, String> {
-    let size = args.size.map_or_else(|| "as stored".to_owned(), |[height, width]| format!("{height}x{width}"));
-    let frames = if stream.protocol.frames == FrameRule::KeyFrames { "key frames" } else { "all" };
-    let entries = [
-        ("protocol", stream.protocol.name.clone()),
-        ("network", stream.loaded.weights.network.clone()),
-        ("weights_sha256", stream.loaded.weights.sha256.clone()),
-        ("size", size),
-        ("frames", frames.to_owned()),
-    ];
-    entries.map(|(key, value)| (key.to_owned(), value)).into()
-}
-
-fn replaced(args: &EvaluateArgs, pass: &Pass) -> anyhow::Result<Replaced> {
-    let Some(path) = &args.real_stats else { return Ok(Replaced::new()) };
-    let saved = SavedStatistics::read(path)?;
-    saved.must_fit(&belongs_to(only_stream(pass)?, args), path)?;
-    Ok(Replaced::from([(Side::Real, saved.statistics)]))
-}
-
-fn save_statistics(
-    path: &Path,
-    args: &EvaluateArgs,
-    pass: &Pass,
-    source: &dyn PictureSource,
-    frames_sha256: &str,
-) -> anyhow::Result<()> {
-    let stream = only_stream(pass)?;
-    let statistics = stream.side(Side::Generated).moments.statistics(&source.describe())?;
-    let mut metadata = belongs_to(stream, args);
-    let further = [
-        ("dataset", source.describe()),
-        ("frames_sha256", frames_sha256.to_owned()),
-        ("seed", args.seed.to_string()),
-        ("code", code_version()),
-    ];
-    metadata.extend(further.map(|(key, value)| (key.to_owned(), value)));
-    let count = statistics.count.unwrap_or(0);
-    SavedStatistics { statistics, metadata }.write(path)?;
-    say(format_args!("statistics of {count} samples written to {}", path.display()))
 }

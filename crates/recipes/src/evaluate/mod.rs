@@ -20,9 +20,7 @@ use anyhow::Context;
 
 pub use chart::Curve;
 pub use detections::{detection_markdown, detection_score};
-pub use network::{
-    Loaded, NetworkFolder, PictureNetwork, Pictures, SeamMatcher, WeightsUsed, network_input, sha256_of,
-};
+pub use network::{Loaded, NetworkFolder, PictureNetwork, Pictures, SeamMatcher, WeightsUsed, network_input};
 pub use page::{draw_curves, draw_report};
 pub use painted::Painted;
 pub use pass::{Pass, PassOptions};
@@ -32,17 +30,13 @@ pub use source::{DatasetPictures, Folder, Instant, PictureSource, Shot};
 pub use statistics_file::SavedStatistics;
 pub use streams::{ClipCutter, FeatureStream, SeamStream, Side, SideFeatures};
 
-/// Writes a file beside its final name, then renames it, so that no reader meets half a file.
+/// Writes a file so that no reader meets half of it; makes the folder it lies in.
 ///
 /// # Errors
 /// Names the file.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+pub fn write_file(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
         std::fs::create_dir_all(parent).with_context(|| format!("cannot make the folder {}", parent.display()))?;
     }
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".part");
-    let part = path.with_file_name(name);
-    std::fs::write(&part, bytes).with_context(|| format!("cannot write {}", part.display()))?;
-    std::fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
+    Ok(train::replace_file(path, bytes)?)
 }

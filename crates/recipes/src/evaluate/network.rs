@@ -1,13 +1,11 @@
 //! The networks that metrics look through, and what a number may be called when it was computed with them.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use burn::tensor::{Device, Tensor, TensorData};
 use features::{Tap, Vgg16};
 use metrics::{Feature, Raster, ResizeFilter, Seam, mutual_matches};
-use sha2::{Digest, Sha256};
 
 /// A file of weights as it was read.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -126,24 +124,7 @@ fn load_vgg(path: &Path, device: &Device) -> anyhow::Result<Vgg16> {
 
 fn weights_used(network: &str, path: &Path) -> anyhow::Result<WeightsUsed> {
     let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    Ok(WeightsUsed { network: network.to_owned(), file, sha256: sha256_of(path)? })
-}
-
-/// SHA-256 of a file in hexadecimal.
-///
-/// # Errors
-/// A file that cannot be read.
-pub fn sha256_of(path: &Path) -> anyhow::Result<String> {
-    let unreadable = || format!("cannot read {}", path.display());
-    let mut file = std::fs::File::open(path).with_context(unreadable)?;
-    let (mut hash, mut block) = (Sha256::new(), vec![0; 1 << 16]);
-    loop {
-        let read = file.read(&mut block).with_context(unreadable)?;
-        if read == 0 {
-            return Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect());
-        }
-        hash.update(block.get(..read).unwrap_or_default());
-    }
+    Ok(WeightsUsed { network: network.to_owned(), file, sha256: train::fingerprint(path)?.1 })
 }
 
 /// A picture as a network wants it: resized by the protocol's filter, values in [0, 1], planes.

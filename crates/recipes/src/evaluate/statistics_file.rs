@@ -51,7 +51,7 @@ impl SavedStatistics {
             Some("safetensors") => self.safetensors()?,
             _ => bail!("statistics end in .safetensors, or .npz for pytorch-fid: {}", path.display()),
         };
-        super::write_atomically(path, &bytes)
+        super::write_file(path, &bytes)
     }
 
     /// Refuses statistics that were made in another way.
