@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::displayed;
+use crate::{Mean, Pixel};
 
 /// Peak signal-to-noise ratio in dB of a mean squared error on the [0, 1] scale; infinite for zero.
 #[must_use]
@@ -15,21 +15,21 @@ pub fn psnr_db(mse: f64) -> f64 {
 /// # Panics
 /// When the lengths differ or are zero.
 #[must_use]
-pub fn image_mse(prediction: &[f32], target: &[f32]) -> f64 {
+pub fn image_mse<P: Pixel>(prediction: &[P], target: &[P]) -> f64 {
     assert_eq!(prediction.len(), target.len(), "values of prediction and target");
     assert!(!target.is_empty(), "an image without pixels has no error");
-    let squares = prediction.iter().zip(target).map(|(&p, &t)| (displayed(p) - displayed(t)).powi(2));
+    let squares = prediction.iter().zip(target).map(|(&p, &t)| (p.displayed() - t.displayed()).powi(2));
     squares.sum::<f64>() / target.len() as f64
 }
 
 /// Collects the PSNR of images one at a time.
 ///
 /// Images may come in any order and be split over any number of collectors that are [merged](Psnr::merge): the result
-/// is the same to the last bit, because the values are summed in sorted order at the end.
+/// is the same to the last bit, because the values are summed without rounding. Memory does not grow.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Psnr {
     /// dB per image, identical images left out.
-    values_db: Vec<f64>,
+    db: Mean,
     identical: usize,
 }
 
@@ -49,12 +49,12 @@ impl Psnr {
     ///
     /// # Panics
     /// When the lengths differ or are zero.
-    pub fn update(&mut self, prediction: &[f32], target: &[f32]) -> f64 {
+    pub fn update<P: Pixel>(&mut self, prediction: &[P], target: &[P]) -> f64 {
         let db = psnr_db(image_mse(prediction, target));
         if db == f64::INFINITY {
             self.identical += 1;
         } else {
-            self.values_db.push(db);
+            self.db.add(db);
         }
         db
     }
@@ -67,12 +67,12 @@ impl Psnr {
     ///
     /// # Panics
     /// When the lengths do not fit.
-    pub fn update_where(&mut self, prediction: &[f32], target: &[f32], counts: &[bool]) -> Option<f64> {
+    pub fn update_where<P: Pixel>(&mut self, prediction: &[P], target: &[P], counts: &[bool]) -> Option<f64> {
         assert!(target.len().is_multiple_of(counts.len()), "whole planes of {} pixels", counts.len());
         if counts.iter().all(|counts| *counts) {
             return Some(self.update(prediction, target));
         }
-        let chosen = |image: &[f32]| -> Vec<f32> {
+        let chosen = |image: &[P]| -> Vec<P> {
             image.iter().zip(counts.iter().cycle()).filter(|(_, counts)| **counts).map(|(value, _)| *value).collect()
         };
         let target = chosen(target);
@@ -80,18 +80,16 @@ impl Psnr {
     }
 
     /// Adds every image of another collector.
-    pub fn merge(&mut self, other: Self) {
-        self.values_db.extend(other.values_db);
+    pub fn merge(&mut self, other: &Self) {
+        self.db.merge(&other.db);
         self.identical += other.identical;
     }
 
     /// The result so far.
     #[must_use]
     pub fn summary(&self) -> PsnrSummary {
-        let mut sorted = self.values_db.clone();
-        sorted.sort_by(f64::total_cmp);
-        let mean_db = (!sorted.is_empty()).then(|| sorted.iter().sum::<f64>() / sorted.len() as f64);
-        PsnrSummary { mean_db, images: sorted.len() + self.identical, identical: self.identical }
+        let images = self.db.count() as usize + self.identical;
+        PsnrSummary { mean_db: self.db.mean(), images, identical: self.identical }
     }
 }
 
@@ -150,7 +148,7 @@ mod tests {
         let whole = collect(&images).summary();
         for split in [0, 1, 17, 38] {
             let mut merged = collect(&images[split..]);
-            merged.merge(collect(&images[..split]));
+            merged.merge(&collect(&images[..split]));
             assert_eq!(merged.summary(), whole);
         }
     }

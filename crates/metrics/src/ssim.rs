@@ -2,16 +2,19 @@
 //!
 //! Wang et al., "Image Quality Assessment: From Error Visibility to Structural Similarity", equation 13 with
 //! K1 = 0.01, K2 = 0.03; mean over the windows that lie inside the image, then over channels. Parity:
-//! `tests/it/main.rs`.
+//! `tests/it/pictures.rs`.
 
-use crate::displayed;
+use serde::{Deserialize, Serialize};
+
+use crate::Pixel;
 
 /// (0.01 · range)² and (0.03 · range)².
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
 /// Which window the local statistics are taken over. The two protocols give different numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum SsimWindow {
     /// 7×7 box with sample covariance (n / (n - 1), n = 49): scikit-image's default.
     Uniform7,
@@ -31,6 +34,15 @@ pub struct ImageSize {
 }
 
 impl SsimWindow {
+    /// Pixels along one axis; smaller pictures have no value.
+    #[must_use]
+    pub fn side(self) -> usize {
+        match self {
+            Self::Uniform7 => 7,
+            Self::Gauss11 => 11,
+        }
+    }
+
     /// Weights along one axis, their sum is 1.
     fn taps(self) -> Vec<f64> {
         match self {
@@ -57,43 +69,83 @@ impl SsimWindow {
 /// # Panics
 /// When a length does not fit the size, or a side is shorter than the window.
 #[must_use]
-pub fn ssim(prediction: &[f32], target: &[f32], size: ImageSize, window: SsimWindow) -> f64 {
-    let ImageSize { channels, height, width } = size;
+pub fn ssim<P: Pixel>(prediction: &[P], target: &[P], size: ImageSize, window: SsimWindow) -> f64 {
+    let (x, y) = (displayed_values(prediction, size), displayed_values(target, size));
+    let per_channel = similarities(&x, &y, size, window);
+    per_channel.iter().map(|found| found.whole).sum::<f64>() / size.channels as f64
+}
+
+/// Means over the windows of one channel.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Similarity {
+    /// Luminance, contrast and structure.
+    pub(crate) whole: f64,
+    /// Contrast and structure alone.
+    pub(crate) contrast: f64,
+}
+
+/// An image in f64, as it would be shown.
+pub(crate) fn displayed_values<P: Pixel>(image: &[P], size: ImageSize) -> Vec<f64> {
+    assert_eq!(image.len(), size.channels * size.height * size.width, "values of an image of {size:?}");
+    image.iter().map(|value| value.displayed()).collect()
+}
+
+/// Channel by channel.
+pub(crate) fn similarities(x: &[f64], y: &[f64], size: ImageSize, window: SsimWindow) -> Vec<Similarity> {
+    let ImageSize { height, width, .. } = size;
     let taps = window.taps();
     assert!(height.min(width) >= taps.len(), "{height}x{width} is smaller than the window");
-    let plane = height * width;
-    for image in [prediction, target] {
-        assert_eq!(image.len(), channels * plane, "values of an image of {size:?}");
-    }
-    let pairs = prediction.chunks_exact(plane).zip(target.chunks_exact(plane));
-    pairs.map(|(p, t)| plane_ssim(p, t, width, &taps, window.covariance_factor())).sum::<f64>() / channels as f64
+    let planes = x.chunks_exact(height * width).zip(y.chunks_exact(height * width));
+    planes.map(|(x, y)| plane_similarity(x, y, width, &taps, window.covariance_factor())).collect()
 }
 
-fn plane_ssim(x: &[f32], y: &[f32], width: usize, taps: &[f64], covariance_factor: f64) -> f64 {
-    let x: Vec<f64> = x.iter().map(|&value| displayed(value)).collect();
-    let y: Vec<f64> = y.iter().map(|&value| displayed(value)).collect();
-    let mean = |values: Vec<f64>| filter(&values, width, taps);
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect();
-    let (xx, yy, xy) = (mean(product(&x, &x)), mean(product(&y, &y)), mean(product(&x, &y)));
-    let (mx, my) = (mean(x), mean(y));
-
-    let local = (0..mx.len()).map(|i| {
-        let (vx, vy, vxy) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
-        let [vx, vy, vxy] = [vx, vy, vxy].map(|v| v * covariance_factor);
-        let likeness = (2.0 * mx[i] * my[i] + C1) * (2.0 * vxy + C2);
-        likeness / ((mx[i] * mx[i] + my[i] * my[i] + C1) * (vx + vy + C2))
-    });
-    local.sum::<f64>() / mx.len() as f64
-}
-
-/// Separable filter over the windows inside the plane; the result is `taps.len() - 1` smaller on both axes.
-fn filter(plane: &[f64], width: usize, taps: &[f64]) -> Vec<f64> {
+fn plane_similarity(x: &[f64], y: &[f64], width: usize, taps: &[f64], covariance_factor: f64) -> Similarity {
+    let product: Vec<f64> = x.iter().zip(y).map(|(x, y)| x * y).collect();
+    // The formula needs the two variances only as a sum.
+    let squares: Vec<f64> = x.iter().zip(y).map(|(x, y)| x * x + y * y).collect();
+    let rows = x.len() / width - taps.len() + 1;
     let inner = width - taps.len() + 1;
-    let weigh = |start: &[f64], step: usize| taps.iter().enumerate().map(|(k, tap)| tap * start[k * step]).sum();
-    let rows: Vec<f64> =
-        plane.chunks_exact(width).flat_map(|row| (0..inner).map(move |i| weigh(&row[i..], 1))).collect();
-    let heights = rows.len() / inner - taps.len() + 1;
-    (0..heights * inner).map(|i| weigh(&rows[i..], inner)).collect()
+    let mut lines = [0; 4].map(|_| LineFilter { across: vec![0.0; width], means: vec![0.0; inner] });
+    let (mut whole, mut contrast) = (0.0, 0.0);
+    for row in 0..rows {
+        for (line, plane) in lines.iter_mut().zip([x, y, &product, &squares]) {
+            line.apply(&plane[row * width..(row + taps.len()) * width], taps);
+        }
+        let [mx, my, mxy, msq] = lines.each_ref().map(|line| line.means.as_slice());
+        for (((mx, my), mxy), msq) in mx.iter().zip(my).zip(mxy).zip(msq) {
+            let centre = mx * mx + my * my;
+            let covariance = (mxy - mx * my) * covariance_factor;
+            let variances = (msq - centre) * covariance_factor;
+            let shape = (2.0 * covariance + C2) / (variances + C2);
+            contrast += shape;
+            whole += (2.0 * mx * my + C1) / (centre + C1) * shape;
+        }
+    }
+    let count = (rows * inner) as f64;
+    Similarity { whole: whole / count, contrast: contrast / count }
+}
+
+/// Weighted means over the windows of one row of windows, first down the columns, then along the row.
+struct LineFilter {
+    across: Vec<f64>,
+    means: Vec<f64>,
+}
+
+impl LineFilter {
+    /// `rows` are as many rows as there are taps.
+    fn apply(&mut self, rows: &[f64], taps: &[f64]) {
+        let weigh = |sums: &mut [f64], values: &[f64], tap: f64| {
+            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += tap * value);
+        };
+        self.across.fill(0.0);
+        for (row, tap) in rows.chunks_exact(self.across.len()).zip(taps) {
+            weigh(&mut self.across, row, *tap);
+        }
+        self.means.fill(0.0);
+        for (shift, tap) in taps.iter().enumerate() {
+            weigh(&mut self.means, &self.across[shift..], *tap);
+        }
+    }
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ pub mod autoencoder;
 pub mod bev_vae;
 pub mod commands;
 pub mod config_file;
+pub mod evaluate;
 pub mod latent_diffusion;
 mod loader_source;
 mod model_choice;

@@ -27,7 +27,10 @@ pub(crate) fn write_synced(path: &Path, content: &[u8]) -> Result<(), TrainError
 }
 
 /// Replaces a file so that at every moment either the old or the new content is there.
-pub(crate) fn replace_file(path: &Path, content: &[u8]) -> Result<(), TrainError> {
+///
+/// # Errors
+/// [`TrainError`] naming the file.
+pub fn replace_file(path: &Path, content: &[u8]) -> Result<(), TrainError> {
     let mut name = std::ffi::OsString::from(".tmp-");
     name.push(path.file_name().unwrap_or_default());
     let beside = path.with_file_name(name);
@@ -36,8 +39,11 @@ pub(crate) fn replace_file(path: &Path, content: &[u8]) -> Result<(), TrainError
     path.parent().map_or(Ok(()), sync_folder)
 }
 
-/// Length in bytes and SHA-256 of a file.
-pub(crate) fn fingerprint(path: &Path) -> Result<(u64, String), TrainError> {
+/// Length in bytes and SHA-256 of a file, in hexadecimal.
+///
+/// # Errors
+/// [`TrainError`] naming the file.
+pub fn fingerprint(path: &Path) -> Result<(u64, String), TrainError> {
     let mut file = File::open(path).map_err(TrainError::io("open", path))?;
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 1 << 20];

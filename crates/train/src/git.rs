@@ -4,7 +4,8 @@ use std::fs;
 use std::path::Path;
 
 /// Commit of the repository that holds `start`, `None` outside of one.
-pub(crate) fn head_commit(start: &Path) -> Option<String> {
+#[must_use]
+pub fn head_commit(start: &Path) -> Option<String> {
     let git = start.ancestors().map(|folder| folder.join(".git")).find(|git| git.is_dir())?;
     let head = fs::read_to_string(git.join("HEAD")).ok()?;
     let Some(name) = head.trim().strip_prefix("ref: ") else { return Some(head.trim().to_string()) };

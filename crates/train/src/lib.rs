@@ -37,6 +37,8 @@ pub use checkpoint_store::{CheckpointStore, find_checkpoint};
 pub use device::DeviceConfig;
 pub use ema::{Ema, EmaConfig};
 pub use error::TrainError;
+pub use files::{fingerprint, replace_file};
+pub use git::head_commit;
 pub use guard::{GuardVerdict, NonFiniteGuard};
 pub use interrupt::Interrupt;
 pub use lanes::in_lanes;

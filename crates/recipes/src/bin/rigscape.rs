@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs, ShowDataArgs, check_data, info,
-    make_data, novel_view, reconstruct, run_main, sample, show_data,
+    CheckDataArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs, ShowDataArgs,
+    check_data, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -21,6 +21,7 @@ enum Command {
     MakeData(MakeDataArgs),
     CheckData(CheckDataArgs),
     ShowData(ShowDataArgs),
+    Evaluate(Box<EvaluateArgs>),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
@@ -33,6 +34,7 @@ fn main() -> ExitCode {
         Command::MakeData(args) => make_data(args),
         Command::CheckData(args) => check_data(args),
         Command::ShowData(args) => show_data(args),
+        Command::Evaluate(args) => evaluate(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),

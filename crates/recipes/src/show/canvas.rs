@@ -5,28 +5,28 @@ use geometry::glam::DVec2;
 use image::{Rgb, RgbImage};
 
 /// Red, green, blue.
-pub(super) type Color = [u8; 3];
+pub(crate) type Color = [u8; 3];
 
 /// Side of a letter at scale 1, px.
 const LETTER: u32 = 8;
 
 /// A picture that is drawn on; whatever lies outside is cut off.
 #[derive(Debug, Clone)]
-pub(super) struct Canvas {
-    pub(super) picture: RgbImage,
+pub(crate) struct Canvas {
+    pub(crate) picture: RgbImage,
 }
 
 impl Canvas {
-    pub(super) fn new(width: u32, height: u32, color: Color) -> Self {
+    pub(crate) fn new(width: u32, height: u32, color: Color) -> Self {
         Self { picture: RgbImage::from_pixel(width, height, Rgb(color)) }
     }
 
-    pub(super) fn size(&self) -> DVec2 {
+    pub(crate) fn size(&self) -> DVec2 {
         DVec2::new(f64::from(self.picture.width()), f64::from(self.picture.height()))
     }
 
     /// Mixes a colour into one pixel; `amount` in [0, 1].
-    pub(super) fn blend(&mut self, x: i64, y: i64, color: Color, amount: f64) {
+    pub(crate) fn blend(&mut self, x: i64, y: i64, color: Color, amount: f64) {
         let inside = u32::try_from(x).ok().zip(u32::try_from(y).ok());
         if let Some(pixel) = inside.and_then(|(x, y)| self.picture.get_pixel_mut_checked(x, y)) {
             for (old, new) in pixel.0.iter_mut().zip(color) {
@@ -35,7 +35,7 @@ impl Canvas {
         }
     }
 
-    pub(super) fn rectangle(&mut self, low: DVec2, size: DVec2, color: Color, amount: f64) {
+    pub(crate) fn rectangle(&mut self, low: DVec2, size: DVec2, color: Color, amount: f64) {
         let (low, high) = (low.max(DVec2::ZERO).round(), (low + size).min(self.size()).round());
         for y in low.y as i64..high.y as i64 {
             for x in low.x as i64..high.x as i64 {
@@ -45,7 +45,7 @@ impl Canvas {
     }
 
     /// A smooth straight line of this width.
-    pub(super) fn line(&mut self, from: DVec2, to: DVec2, color: Color, width: f64) {
+    pub(crate) fn line(&mut self, from: DVec2, to: DVec2, color: Color, width: f64) {
         let Some((from, to)) = clip(from, to, DVec2::splat(-2.0 * width), self.size() + 2.0 * width) else { return };
         let steep = (to.y - from.y).abs() > (to.x - from.x).abs();
         let turned = |p: DVec2| if steep { DVec2::new(p.y, p.x) } else { p };
@@ -69,7 +69,7 @@ impl Canvas {
         }
     }
 
-    pub(super) fn polyline(&mut self, points: &[DVec2], color: Color, width: f64) {
+    pub(crate) fn polyline(&mut self, points: &[DVec2], color: Color, width: f64) {
         for pair in points.windows(2) {
             if let [a, b] = pair {
                 self.line(*a, *b, color, width);
@@ -78,7 +78,7 @@ impl Canvas {
     }
 
     /// The inside of rings by the even-odd rule, so that inner rings are holes.
-    pub(super) fn fill(&mut self, rings: &[Vec<DVec2>], color: Color, amount: f64) {
+    pub(crate) fn fill(&mut self, rings: &[Vec<DVec2>], color: Color, amount: f64) {
         let points = || rings.iter().flatten().filter(|point| point.is_finite());
         let low = points().fold(self.size().y, |low, point| low.min(point.y)).max(0.0) as i64;
         let high = points().fold(0.0f64, |high, point| high.max(point.y)).min(self.size().y) as i64;
@@ -96,7 +96,7 @@ impl Canvas {
     }
 
     /// Letters of basic Latin, `scale` times 8 px high; others become `?`. Gives the x after the last letter.
-    pub(super) fn text(&mut self, at: DVec2, scale: u32, color: Color, text: &str) -> f64 {
+    pub(crate) fn text(&mut self, at: DVec2, scale: u32, color: Color, text: &str) -> f64 {
         let (left, top) = (at.x.round() as i64, at.y.round() as i64);
         for (place, letter) in text.chars().enumerate() {
             let known = BASIC_LEGACY.get(letter as usize).or(BASIC_LEGACY.get('?' as usize));
@@ -114,24 +114,24 @@ impl Canvas {
     }
 
     /// Letters on a dark ground.
-    pub(super) fn label(&mut self, at: DVec2, scale: u32, color: Color, text: &str) {
+    pub(crate) fn label(&mut self, at: DVec2, scale: u32, color: Color, text: &str) {
         let pad = f64::from(scale) * 2.0;
         let size = DVec2::new(text_width(text, scale), f64::from(LETTER * scale)) + 2.0 * pad;
         self.rectangle(at, size, [0, 0, 0], 0.65);
         self.text(at + pad, scale, color, text);
     }
 
-    pub(super) fn paste(&mut self, picture: &RgbImage, x: u32, y: u32) {
+    pub(crate) fn paste(&mut self, picture: &RgbImage, x: u32, y: u32) {
         image::imageops::replace(&mut self.picture, picture, i64::from(x), i64::from(y));
     }
 }
 
-pub(super) fn text_width(text: &str, scale: u32) -> f64 {
+pub(crate) fn text_width(text: &str, scale: u32) -> f64 {
     text.chars().count() as f64 * f64::from(LETTER * scale)
 }
 
 /// Height of a line of text with its gap, px.
-pub(super) const fn line_height(scale: u32) -> u32 {
+pub(crate) const fn line_height(scale: u32) -> u32 {
     LETTER * scale + 4 * scale
 }
 
@@ -145,7 +145,7 @@ fn crossings(ring: &[DVec2], row: f64) -> Vec<f64> {
 }
 
 /// The part of a segment inside a rectangle.
-pub(super) fn clip(from: DVec2, to: DVec2, low: DVec2, high: DVec2) -> Option<(DVec2, DVec2)> {
+pub(crate) fn clip(from: DVec2, to: DVec2, low: DVec2, high: DVec2) -> Option<(DVec2, DVec2)> {
     if !(from.is_finite() && to.is_finite()) {
         return None;
     }

@@ -2,7 +2,7 @@
 //! things from above. What does not fit together shows at a glance.
 
 mod bev;
-mod canvas;
+pub(crate) mod canvas;
 mod colors;
 mod legend;
 mod objects;

@@ -1,0 +1,204 @@
+//! Every metric worsens as pictures get worse: blur, noise, JPEG and shuffled views on the real nuScenes frame.
+
+use std::path::PathBuf;
+
+use data::nuscenes::{NuScenes, NuScenesConfig};
+use image::RgbImage;
+use image::codecs::jpeg::JpegEncoder;
+use metrics::{
+    FeatureRows, Moments, Protocol, Raster, ResizeFilter, ViewConsistency, frechet_distance, polynomial_mmd, seam,
+    seam_pairs,
+};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rigscape::evaluate::{
+    Curve, DatasetPictures, Instant, Loaded, NetworkFolder, PictureNetwork, PictureSource, Pictures, SeamMatcher, Shot,
+    draw_curves, measure, network_input,
+};
+use rigscape::sheet::save_picture;
+
+use crate::evaluate::weights;
+use crate::programs::data;
+
+/// Rows and columns at which pictures are compared.
+const SIZE: (usize, usize) = (176, 320);
+/// Rows and columns at which seams are matched.
+const SEAM_SIZE: (usize, usize) = (64, 128);
+/// Parts of every view that are samples of the set metrics: columns of tiles.
+const TILES: usize = 3;
+
+fn image_of(picture: &Raster<u8>) -> RgbImage {
+    RgbImage::from_raw(picture.width as u32, picture.height as u32, picture.pixels.clone()).unwrap()
+}
+
+fn raster(picture: RgbImage) -> Raster<u8> {
+    let (height, width) = (picture.height() as usize, picture.width() as usize);
+    Raster { height, width, pixels: picture.into_raw() }
+}
+
+fn blurred(picture: &Raster<u8>, sigma: f64) -> Raster<u8> {
+    raster(image::imageops::blur(&image_of(picture), sigma as f32))
+}
+
+fn noisy(picture: &Raster<u8>, amplitude: f64) -> Raster<u8> {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut value = |value: u8| {
+        // The sum of three is nearly normal.
+        let noise: f64 = (0..3).map(|_| rng.random_range(-1.0..1.0)).sum();
+        (f64::from(value) + amplitude * noise).round().clamp(0.0, 255.0) as u8
+    };
+    let pixels = picture.pixels.iter().map(|byte| value(*byte)).collect();
+    Raster { pixels, ..*picture }
+}
+
+fn jpeg(picture: &Raster<u8>, loss: f64) -> Raster<u8> {
+    let mut bytes = Vec::new();
+    JpegEncoder::new_with_quality(&mut bytes, (100.0 - loss) as u8).encode_image(&image_of(picture)).unwrap();
+    raster(image::load_from_memory(&bytes).unwrap().to_rgb8())
+}
+
+/// The first views in reverse order, each under its neighbour's name.
+fn shuffled(instant: &Instant, count: f64) -> Instant {
+    let mut changed = instant.clone();
+    let count = count as usize;
+    for at in 0..count {
+        changed.views[at].picture = instant.views[count - 1 - at].picture.clone();
+    }
+    changed
+}
+
+fn each(instant: &Instant, change: impl Fn(&Raster<u8>) -> Raster<u8>) -> Instant {
+    let views = instant.views.iter().map(|shot| Shot { channel: shot.channel.clone(), picture: change(&shot.picture) });
+    Instant { views: views.collect(), ..instant.clone() }
+}
+
+struct Instruments {
+    pairs: Vec<Protocol>,
+    network: Loaded<dyn PictureNetwork>,
+    matcher: Loaded<dyn SeamMatcher>,
+}
+
+impl Instruments {
+    fn rows(&self, instant: &Instant) -> Vec<f32> {
+        let feature = self.network.network.feature();
+        let mut values = Vec::new();
+        let mut count = 0;
+        for shot in &instant.views {
+            let width = shot.picture.width / TILES;
+            for tile in 0..TILES {
+                let part = shot.picture.cropped(0, tile * width, shot.picture.height, width).unwrap();
+                values.extend(network_input(&part, feature));
+                count += 1;
+            }
+        }
+        let [height, width] = feature.size;
+        self.network.network.features(Pictures { count, height, width, values: &values }).unwrap()
+    }
+
+    fn consistency(&self, instant: &Instant) -> f64 {
+        let (height, width) = SEAM_SIZE;
+        let views = each(instant, |picture| picture.resized(height, width, ResizeFilter::PilBilinear)).views;
+        let planes: Vec<Vec<f32>> =
+            views.iter().map(|shot| shot.picture.map(|value| f32::from(value) / 255.0).planes()).collect();
+        let size = metrics::ImageSize { channels: 3, height, width };
+        let pairs = seam_pairs(&instant.right_of, &vec![true; views.len()]);
+        assert_eq!(pairs.len(), views.len(), "six views close the ring");
+        let seams: Vec<_> = pairs.iter().map(|(a, b)| seam(&planes[*a], &planes[*b], size).unwrap()).collect();
+        let confidences = self.matcher.network.confidences(&seams).unwrap();
+        ViewConsistency::default().update(confidences.iter().map(Vec::as_slice))
+    }
+
+    /// Names, values, and whether higher is better.
+    fn measure(&self, real: &Instant, changed: &Instant) -> Vec<(String, f64, bool)> {
+        let mut found = Vec::new();
+        for protocol in &self.pairs {
+            let views = real.views.iter().zip(&changed.views);
+            let values = views.map(|(real, changed)| measure(protocol, &real.picture, &changed.picture).unwrap());
+            let mean = values.map(|value| value.min(100.0)).sum::<f64>() / real.views.len() as f64;
+            found.push((protocol.name.clone(), mean, true));
+        }
+        let width = self.network.network.width();
+        let (real_rows, changed_rows) = (self.rows(real), self.rows(changed));
+        let statistics = |rows: &[f32]| {
+            let mut moments = Moments::new(width);
+            moments.update(rows).unwrap();
+            moments.statistics("tiles").unwrap()
+        };
+        let network = self.network.stand_in.clone().unwrap_or_default();
+        let distance = frechet_distance(&statistics(&changed_rows), &statistics(&real_rows)).unwrap();
+        found.push((format!("fid-{network}"), distance.value, false));
+        let table = |rows: Vec<f32>| FeatureRows::new(width, rows).unwrap();
+        let kernel = polynomial_mmd(&table(changed_rows), &table(real_rows)).unwrap();
+        found.push((format!("kid-{network}"), kernel, false));
+        let matcher = self.matcher.stand_in.clone().unwrap_or_default();
+        found.push((format!("mvsc-{matcher}"), self.consistency(changed) / self.consistency(real), true));
+        found
+    }
+}
+
+fn instruments() -> Option<(Instruments, Instant)> {
+    let (weights, root) = (weights()?, data("nuscenes_keyframe")?);
+    let version = std::fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let version = version.into_iter().find(|name| name.starts_with("v1.0")).unwrap();
+    let dataset = NuScenes::open(&NuScenesConfig::new(root, version)).unwrap();
+    let pictures = DatasetPictures::new(std::sync::Arc::new(dataset), 0);
+    let (height, width) = SIZE;
+    let real = each(&pictures.instant(0).unwrap(), |picture| picture.resized(height, width, ResizeFilter::PilBicubic));
+    let networks = NetworkFolder { folders: vec![weights], device: train::DeviceConfig::Flex.open().unwrap() };
+    let names = ["psnr/bev-vae", "ssim/skimage7", "ssim/gauss11", "ms_ssim/gauss11"];
+    let known = Protocol::built_in().unwrap();
+    let named = |name: &&str| known.iter().find(|protocol| protocol.name == **name).unwrap().clone();
+    let set = named(&"fid/plain");
+    let network = networks.pictures(set.feature().unwrap()).unwrap();
+    let instruments =
+        Instruments { pairs: names.iter().map(named).collect(), network, matcher: networks.matcher().unwrap() };
+    Some((instruments, real))
+}
+
+#[test]
+fn every_metric_worsens_with_growing_damage() {
+    let Some((instruments, real)) = instruments() else { return };
+    let damages: [(&str, &[f64], &dyn Fn(&Instant, f64) -> Instant); 4] = [
+        ("blur, deviation in px", &[0.5, 1.0, 2.0, 4.0], &|real, level| each(real, |picture| blurred(picture, level))),
+        ("noise, amplitude of 255", &[6.0, 12.0, 24.0, 48.0], &|real, level| {
+            each(real, |picture| noisy(picture, level))
+        }),
+        ("JPEG, 100 - quality", &[10.0, 50.0, 80.0, 95.0], &|real, level| each(real, |picture| jpeg(picture, level))),
+        ("views in reverse order", &[2.0, 4.0, 6.0], &shuffled),
+    ];
+    let mut charts = Vec::new();
+    for (damage, levels, apply) in damages {
+        let shuffling = damage.starts_with("views");
+        let mut curves: Vec<Curve> = Vec::new();
+        for level in levels {
+            let found = instruments.measure(&real, &apply(&real, *level));
+            for (at, (name, value, _)) in found.iter().enumerate() {
+                if curves.len() <= at {
+                    curves.push(Curve { name: name.clone(), points: Vec::new() });
+                }
+                curves[at].points.push([*level, *value]);
+            }
+            if *level == levels[0] {
+                continue;
+            }
+            for (curve, (name, _, higher_is_better)) in curves.iter().zip(&found) {
+                let [.., before, now] = curve.points.as_slice() else { unreachable!("two levels") };
+                let worse = if *higher_is_better { now[1] < before[1] } else { now[1] > before[1] };
+                // A set of pictures is the same set in any order.
+                let blind = shuffling && !higher_is_better;
+                if blind {
+                    assert!((now[1] - before[1]).abs() < 1e-6, "{name} under {damage}: {curve:?}");
+                } else {
+                    assert!(worse, "{name} under {damage}: {curve:?}");
+                }
+            }
+        }
+        charts.push((damage.to_owned(), curves));
+    }
+    let picture = draw_curves("Real nuScenes frame, six views: every curve scaled to its own range", &charts);
+    let folder = tempfile::tempdir().unwrap();
+    let path =
+        std::env::var_os("RIGSCAPE_SENSITIVITY_PNG").map_or(folder.path().join("sensitivity.png"), PathBuf::from);
+    save_picture(&picture, &path).unwrap();
+    assert!(image::open(&path).unwrap().width() > 1000);
+}
