@@ -27,7 +27,6 @@ pub mod occupancy;
 mod parquet_file;
 mod pass;
 mod permutation;
-pub mod pickle;
 mod polygon;
 mod procedural;
 mod procedural_cache;

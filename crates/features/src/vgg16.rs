@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use burn::tensor::activation::relu;
-use burn::tensor::module::{conv2d, max_pool2d};
-use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
+use burn::tensor::module::max_pool2d;
+use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use nn::weights::{Mismatch, WeightError, WeightFile};
 use serde::{Deserialize, Serialize};
@@ -192,7 +192,7 @@ impl Conv {
         if x.is_autodiff() {
             (weight, bias) = (Tensor::from_inner(weight), Tensor::from_inner(bias));
         }
-        relu(conv2d(x, weight, Some(bias), ConvOptions::new([1, 1], [1, 1], [1, 1], 1)))
+        relu(ops::conv2d(x, weight, Some(bias), [1; 2], [1; 2]))
     }
 }
 

@@ -4,8 +4,6 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::module::{conv2d, conv3d};
-use burn::tensor::ops::ConvOptions;
 
 use crate::Init;
 use crate::layout::{blocks_from_volume, image_from_patches, patches_from_image};
@@ -56,23 +54,8 @@ impl Linear {
     /// - x: `[.., in]`
     /// - output: `[.., out]`
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        affine(x, self.weight.val().transpose(), self.bias.as_ref().map(Param::val))
+        ops::linear(x, self.weight.val(), self.bias.as_ref().map(Param::val))
     }
-}
-
-/// `x M + b` with all leading axes folded into one product.
-fn affine<const D: usize>(x: Tensor<D>, matrix: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
-    let mut dims = x.dims();
-    let [d_in, d_out] = matrix.dims();
-    assert_eq!(dims[D - 1], d_in, "last axis of {dims:?} must be {d_in}");
-    let rows = dims[..D - 1].iter().product::<usize>();
-    let y = x.reshape([rows, d_in]).matmul(matrix);
-    let y = match bias {
-        Some(bias) => y + bias.unsqueeze::<2>(),
-        None => y,
-    };
-    dims[D - 1] = d_out;
-    y.reshape(dims)
 }
 
 /// Convolution whose stride equals its kernel: one matrix product over patches.
@@ -97,8 +80,7 @@ impl PatchConv2d {
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
         let weight = self.weight.val();
         let [c_out, c_in, k, _] = weight.dims();
-        let matrix = weight.reshape([c_out, c_in * k * k]).transpose();
-        affine(patches_from_image(image, k), matrix, Some(self.bias.val()))
+        ops::linear(patches_from_image(image, k), weight.reshape([c_out, c_in * k * k]), Some(self.bias.val()))
     }
 }
 
@@ -129,7 +111,7 @@ impl PatchDeconv2d {
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let weight = self.weight.val();
         let [c_in, c_out, k, _] = weight.dims();
-        let patches = affine(x, weight.reshape([c_in, c_out * k * k]), None);
+        let patches = ops::linear(x, weight.reshape([c_in, c_out * k * k]).transpose(), None);
         image_from_patches(patches, k) + self.bias.val().reshape([1, c_out, 1, 1])
     }
 }
@@ -156,8 +138,7 @@ impl PatchConv3d {
     pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
         let weight = self.weight.val();
         let [c_out, c_in, k, _, _] = weight.dims();
-        let matrix = weight.reshape([c_out, c_in * k * k * k]).transpose();
-        affine(blocks_from_volume(volume, k), matrix, Some(self.bias.val()))
+        ops::linear(blocks_from_volume(volume, k), weight.reshape([c_out, c_in * k * k * k]), Some(self.bias.val()))
     }
 }
 
@@ -181,7 +162,7 @@ impl Conv3x3 {
     /// - image: `[B, in, H, W]`
     /// - output: `[B, out, H, W]`
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
-        conv2d(image, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1, 1], [1, 1], [1, 1], 1))
+        ops::conv2d(image, self.weight.val(), Some(self.bias.val()), [1; 2], [1; 2])
     }
 }
 
@@ -205,6 +186,6 @@ impl Conv3x3x3 {
     /// - volume: `[B, in, Z, Y, X]`
     /// - output: `[B, out, Z, Y, X]`
     pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
-        conv3d(volume, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1; 3], [1; 3], [1; 3], 1))
+        ops::conv3d(volume, self.weight.val(), Some(self.bias.val()), [1; 3], [1; 3])
     }
 }

@@ -25,23 +25,17 @@ impl LayerNorm {
     }
 }
 
-/// Root-mean-square norm over the last axis with a gain.
+/// Gains of a root-mean-square norm; [`ops::rotary_attention`] applies them.
 #[derive(Module, Debug)]
 pub struct RmsNorm {
     /// `[width]`
     pub weight: Param<Tensor<1>>,
-    epsilon: f32,
 }
 
 impl RmsNorm {
     /// Gains 1.
-    pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
-        Self { weight: init.constant([width], 1.0), epsilon }
-    }
-
-    /// Shape unchanged.
-    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::rms_norm(x, self.weight.val(), self.epsilon)
+    pub fn new(width: usize, init: &mut Init) -> Self {
+        Self { weight: init.constant([width], 1.0) }
     }
 }
 

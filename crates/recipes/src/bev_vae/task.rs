@@ -49,6 +49,7 @@ impl BevVaeTask {
     pub fn new(experiment: &Experiment, device: &Device, evaluator: Evaluator) -> anyhow::Result<Self> {
         let model = BevVae::new(&experiment.model.config, &mut Init::new(experiment.seed, device))
             .starting_from(evaluator.means().colour());
+        experiment.optimizer.generator.check(&model)?;
         let adversary = match &experiment.loss.adversarial {
             Adversarial::Off => None,
             Adversarial::Hinge(config) => {
@@ -60,6 +61,7 @@ impl BevVaeTask {
                 // Another stream than the generator's, whose draws depend on its size.
                 let mut init = Init::new(experiment.seed ^ 0xD15C_0000, device);
                 let discriminator = Discriminator::new(image.height, image.width, channels, &mut init)?;
+                experiment.optimizer.discriminator.check(&discriminator)?;
                 let optimizer = Optimizer::new(&experiment.optimizer.discriminator);
                 Some(AdversaryState { config: config.clone(), discriminator, optimizer })
             }

@@ -92,7 +92,7 @@ fn limits_hold() {
     let memo: Vec<u8> = (0..300u32).flat_map(|index| [b"r".as_slice(), &index.to_le_bytes()].concat()).collect();
     let memo = [b"N".as_slice(), &memo, b"."].concat();
     assert_eq!(run(&memo).unwrap_err(), PickleError::Limit { what: "memo entries", limit: 256 });
-    let roomy = Rules { max_memo: 300, ..rules() };
+    let roomy = Rules { limits: Limits { max_memo: 300, ..rules().limits }, ..rules() };
     assert_eq!(decode(&[b"\x80\x04", memo.as_slice()].concat(), &roomy).unwrap(), Value::None);
 }
 
