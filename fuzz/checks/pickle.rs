@@ -1,14 +1,14 @@
-//! Any bytes are refused or decode to a value within the limits, and lists of floats survive being written again.
+//! Any bytes are refused or decode to a value within the limits, and lists of floats survive being written again. As an object graph they
+//! are refused or can be walked.
 
-use pickle::{Limits, Rules, Value, decode, decode_objects, encode_floats, encode_rows};
+use pickle::{Limits, Object, Rules, Value, decode, decode_objects, encode_floats, encode_rows};
 
 /// Classes of the test pickles and one that Python would rather call.
 const CLASSES: [(&str, &str); 3] = [("some.module", "Numbers"), ("builtins", "list"), ("m", "c")];
 
 /// What must hold for any bytes.
 pub fn check(bytes: &[u8]) {
-    // The graph of a weight file's pickle is refused or stands; it is never executed.
-    drop(decode_objects(bytes, Limits { max_bytes: 1 << 16, max_depth: 64, max_values: 4096, max_memo: 1024 }));
+    walk(bytes);
     let rules = Rules::new(&CLASSES);
     let Ok(value) = decode(bytes, &rules) else { return };
     let (values, depth) = measure(&value);
@@ -25,6 +25,30 @@ pub fn check(bytes: &[u8]) {
         assert!(again.items().expect("a list").iter().zip(&rows).all(|(again, row)| same(again, row)));
     }
     drop((value.describe(), value.numbers::<3>(), value.rows::<3, 3>()));
+}
+
+/// Visits an object graph, which may hold itself, up to a number of steps.
+fn walk(bytes: &[u8]) {
+    let limits = Limits { max_bytes: 1 << 16, max_depth: 64, max_values: 4096, max_memo: 4096 };
+    let Ok((graph, read)) = decode_objects(bytes, limits) else { return };
+    assert!(read <= bytes.len());
+    assert!(graph.persistent_ids().count() <= limits.max_values);
+    let mut open: Vec<Object<'_>> = vec![graph.root()];
+    for _ in 0..limits.max_values {
+        let Some(object) = open.pop() else { return };
+        drop((
+            object.describe(),
+            object.global(),
+            object.text(),
+            object.integer(),
+            object.long_digits(),
+            object.bytes(),
+        ));
+        open.extend(object.items().into_iter().flatten().chain(object.persistent_id()));
+        open.extend(object.entries().into_iter().flatten().flat_map(|(key, value)| [key, value]));
+        open.extend(object.call().into_iter().flat_map(|call| call.1));
+        assert!(object.get("a").is_none() || object.entries().is_some());
+    }
 }
 
 /// Number of values and depth of the nesting.
