@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 use super::{LoraError, names_layer};
 use crate::weights::WeightFile;
 
-/// Header entry of diffusers: JSON text whose keys carry the component's name.
+/// Header entry of diffusers: JSON text whose keys carry the component's name, if the file may hold several.
 const HEADER_ENTRY: &str = "lora_adapter_metadata";
 
 /// What PEFT writes beside the weights of one model.
@@ -31,8 +31,11 @@ impl Settings {
     pub(super) fn read(file: &WeightFile, component: &str) -> Result<Self, LoraError> {
         if let Some(text) = file.metadata().get(HEADER_ENTRY) {
             let all: Map<String, Value> = parse(text, file.path())?;
-            let prefix = format!("{component}.");
-            let ours = all.into_iter().filter_map(|(key, value)| Some((key.strip_prefix(&prefix)?.to_owned(), value)));
+            // A file that was saved for one model alone names no component.
+            let ours = all.into_iter().filter_map(|(key, value)| match key.split_once('.') {
+                Some((owner, setting)) => (owner == component).then(|| (setting.to_owned(), value)),
+                None => Some((key, value)),
+            });
             let settings = serde_json::from_value(Value::Object(ours.collect()));
             return settings
                 .map_err(|error| refuse(error.to_string(), file.path()))

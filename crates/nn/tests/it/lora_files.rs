@@ -137,3 +137,17 @@ fn settings_that_change_the_function_are_refused() {
     let error = lora::load(Model::new(&device), "style", &path, "text_encoder").unwrap_err();
     assert!(matches!(error, LoraError::Weights(WeightError::Layout { .. })), "{error}");
 }
+
+#[test]
+fn a_file_of_one_model_alone_names_no_component_in_its_header() {
+    let device = Device::flex();
+    let folder = tempfile::tempdir().unwrap();
+    let (model, path) = saved(LoraLayout::Peft, folder.path());
+    let mut notes = WeightFile::open(&path).unwrap().metadata().clone();
+    let header = notes["lora_adapter_metadata"].replace("\"unet.", "\"");
+    notes.insert("lora_adapter_metadata".to_owned(), header);
+    let other = folder.path().join("other.safetensors");
+    write_safetensors(&other, &renamed(&path, |name| name.replacen("unet.", "", 1)), &notes).unwrap();
+    let loaded = lora::load(Model::new(&device), "style", &other, "unet").unwrap();
+    assert_eq!(bits(loaded.forward(image(&device))), bits(model.forward(image(&device))));
+}

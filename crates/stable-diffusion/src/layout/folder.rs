@@ -21,6 +21,14 @@ pub const CONFIG_FILE: &str = "config.json";
 /// Weights of the network.
 pub const WEIGHTS_FILE: &str = "diffusion_pytorch_model.safetensors";
 
+/// Files that may hold the weights, in order of preference; the last two are torch's own.
+const READ_FILES: [&str; 4] = [
+    WEIGHTS_FILE,
+    "diffusion_pytorch_model.fp16.safetensors",
+    "diffusion_pytorch_model.bin",
+    "diffusion_pytorch_model.fp16.bin",
+];
+
 /// Modules of cross-view attention, for [`load_weights_beside`].
 pub const CROSS_VIEW_MODULES: [&str; 3] = ["norm4", "attn4", "connector"];
 
@@ -156,7 +164,8 @@ impl Network for ControlNet {
 pub fn load_folder<N: Network>(folder: impl AsRef<Path>, device: &Device) -> Result<N, FolderError> {
     let folder = folder.as_ref();
     let config = read_config::<N>(&folder.join(CONFIG_FILE))?;
-    let file = WeightFile::open(folder.join(WEIGHTS_FILE))?;
+    let found = READ_FILES.map(|name| folder.join(name)).into_iter().find(|path| path.exists());
+    let file = WeightFile::open(found.unwrap_or_else(|| folder.join(WEIGHTS_FILE)))?;
     // First values would only be replaced; and no memory is taken before the file's shapes are known to be the config's.
     Ok(load_weights(N::build(&config, &mut Init::lazy(0, device)), &file)?)
 }

@@ -15,7 +15,8 @@ use super::{TextCleaning, TextError, TextOutput};
 use crate::layout::{fill_by_state_dict_name, state_dict_params, state_dict_shapes};
 
 /// Files that may hold the weights, in order of preference.
-const WEIGHT_FILES: [&str; 2] = ["model.safetensors", "model.fp16.safetensors"];
+const WEIGHT_FILES: [&str; 4] =
+    ["model.safetensors", "model.fp16.safetensors", "pytorch_model.bin", "pytorch_model.fp16.bin"];
 
 /// Where a tokenizer's folder may name its padding. The first wins: published folders of Stable Diffusion 2.1 hold
 /// another one in the second.

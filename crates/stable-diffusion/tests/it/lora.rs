@@ -14,7 +14,7 @@ use stable_diffusion::layout::{
 use crate::golden::{Golden, TOLERANCE, compare, folder, golden_weights, json, values_of};
 
 /// Adapter gradients, of their maximum. The reference itself, in f32, lies up to 9e-5 from its twin in f64.
-const GRADIENT_TOLERANCE: f64 = 1e-4;
+const GRADIENT_TOLERANCE: f64 = 2e-4;
 
 /// UNet with golden weights, its inputs and reference outputs.
 fn case(device: &Device) -> Option<(UNet2DCondition, Golden, std::path::PathBuf)> {
