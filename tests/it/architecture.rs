@@ -5,19 +5,35 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The only arrows allowed, as in crates/README.md. `recipes` is the root package.
-const ARROWS: [(&str, &[&str]); 12] = [
+const ARROWS: [(&str, &[&str]); 13] = [
+    ("pickle", &[]),
     ("geometry", &[]),
     ("world", &["geometry"]),
-    ("data", &["geometry", "world"]),
+    ("data", &["pickle", "geometry", "world"]),
     ("ops", &[]),
-    ("nn", &["ops"]),
+    ("nn", &["pickle", "ops"]),
     ("diffusion", &[]),
-    ("features", &["nn"]),
+    ("features", &["ops", "nn"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
     ("stable-diffusion", &["nn", "ops"]),
     ("metrics", &["features"]),
     ("train", &[]),
-    ("rigscape", &["geometry", "world", "data", "ops", "nn", "features", "vae", "metrics", "train"]),
+    (
+        "rigscape",
+        &[
+            "geometry",
+            "world",
+            "data",
+            "ops",
+            "nn",
+            "diffusion",
+            "features",
+            "vae",
+            "stable-diffusion",
+            "metrics",
+            "train",
+        ],
+    ),
 ];
 
 fn root() -> PathBuf {

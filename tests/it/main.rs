@@ -4,6 +4,7 @@ mod architecture;
 mod configs;
 mod data_commands;
 mod evaluate;
+mod latent_runs;
 mod programs;
 mod runs;
 mod sensitivity;

@@ -78,6 +78,8 @@ fn made_data_is_checked_trained_on_and_looked_at() {
     must(rigscape(&[&views[..], &[&text(&sheet)]].concat()));
     let info = must(rigscape(&["info", "--checkpoint", &run]));
     assert!(info.contains("step 2"), "{info}");
+    let weights = must(rigscape(&["info", "--weights"]));
+    assert!(weights.contains("pt_inception-2015-12-05-6726825d.pth"), "{weights}");
 
     // A picture cut in half stops the check and the run, by name.
     let victim = files_below(&out.join("samples"), "jpg").swap_remove(0);

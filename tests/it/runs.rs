@@ -90,9 +90,9 @@ pub fn must(output: Output) -> String {
     text
 }
 
-/// Every file of the last checkpoint by name.
-fn checkpoint(folder: &Path) -> Vec<(String, Vec<u8>)> {
-    let folder = folder.join("runs/run/checkpoints/step_00000008");
+/// Every file of a run's last checkpoint by name.
+fn checkpoint(run: &Path) -> Vec<(String, Vec<u8>)> {
+    let folder = run.join("checkpoints/step_00000008");
     let mut files: Vec<(String, Vec<u8>)> = std::fs::read_dir(&folder)
         .unwrap_or_else(|error| panic!("{}: {error}", folder.display()))
         .map(|entry| entry.unwrap().path())
@@ -104,10 +104,16 @@ fn checkpoint(folder: &Path) -> Vec<(String, Vec<u8>)> {
 
 /// Where a run lives goes into its config and so into its checkpoint; everything else must be equal.
 fn assert_equal_checkpoints(a: &Path, b: &Path) {
+    let parts = ["model", "ema", "optimizer_generator", "discriminator", "optimizer_discriminator"];
+    assert_equal_parts(&a.join("runs/run"), &b.join("runs/run"), &parts);
+}
+
+/// The same for any two runs of 8 steps, given their folders and what a checkpoint holds.
+pub fn assert_equal_parts(a: &Path, b: &Path, parts: &[&str]) {
     let (one, two) = (checkpoint(a), checkpoint(b));
     let names = |files: &[(String, Vec<u8>)]| files.iter().map(|f| f.0.clone()).collect::<Vec<_>>();
     assert_eq!(names(&one), names(&two));
-    for part in ["model", "ema", "optimizer_generator", "discriminator", "optimizer_discriminator"] {
+    for part in parts {
         let name = format!("{part}.safetensors");
         let find = |files: &[(String, Vec<u8>)]| files.iter().find(|f| f.0 == name).unwrap().1.clone();
         assert_eq!(tensors(&find(&one)), tensors(&find(&two)), "{name} differs");
@@ -217,7 +223,7 @@ fn a_debug_network_learns_one_scene() {
     assert!(last < 0.3 * first, "loss went from {first} to {last}");
 }
 
-fn find_number(row: &serde_json::Value, key: &str) -> Option<f64> {
+pub fn find_number(row: &serde_json::Value, key: &str) -> Option<f64> {
     match row {
         serde_json::Value::Object(map) => {
             map.get(key).and_then(serde_json::Value::as_f64).or_else(|| map.values().find_map(|v| find_number(v, key)))

@@ -32,6 +32,40 @@ pub struct SceneBatch {
     pub input: ViewArrays,
     /// What is decoded.
     pub target: ViewArrays,
+    /// How the samples form clips; `None` for a batch of single frames. With clips of T frames every B above and in the arrays stands
+    /// for clips × T, the frames of a clip one after another: `images` is `[B, T, V, 3, H, W]` in memory.
+    pub clips: Option<ClipArrays>,
+}
+
+/// Time and motion of the frames of clips; B clips of T frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ClipArrays {
+    /// B.
+    pub clips: usize,
+    /// T.
+    pub frames: usize,
+    /// `[B, T]` seconds since the first frame of the clip.
+    pub elapsed_secs: Vec<f32>,
+    /// `[B, T, 4, 4]`: maps points of the previous frame's ego frame to this frame's, metres; the identity for the first frame.
+    pub ego_from_previous_ego: Vec<f32>,
+}
+
+impl ClipArrays {
+    /// Of samples that follow one another clip by clip.
+    fn of(samples: &[Sample], frames: usize) -> Self {
+        let mut arrays =
+            Self { clips: samples.len() / frames, frames, elapsed_secs: Vec::new(), ego_from_previous_ego: Vec::new() };
+        for clip in samples.chunks_exact(frames) {
+            let mut previous = &clip[0];
+            for sample in clip {
+                arrays.elapsed_secs.push(((sample.timestamp_ns - clip[0].timestamp_ns) as f64 * 1e-9) as f32);
+                let motion = sample.world_from_ego.inverse() * previous.world_from_ego;
+                arrays.ego_from_previous_ego.extend(motion.to_rows().as_flattened().iter().map(|value| *value as f32));
+                previous = sample;
+            }
+        }
+        arrays
+    }
 }
 
 /// Pictures and matrices of B × V views, row-major. A view that is padding, that has no picture or that was dropped has mask `false`,
@@ -193,8 +227,21 @@ pub fn assemble(samples: Vec<Sample>, pad: PadViews) -> Result<SceneBatch, DataE
         input,
         target,
         texts: samples.iter().map(|s| s.text.clone()).collect(),
+        clips: None,
         ids: samples.into_iter().map(|s| s.id).collect(),
     })
+}
+
+/// Pads and joins the frames of clips, `frames` samples for each clip, clip after clip.
+///
+/// # Errors
+/// As [`assemble`]; [`DataError::Config`] for clips of no frames and for samples that do not fill the last clip.
+pub fn assemble_clips(samples: Vec<Sample>, frames: usize, pad: PadViews) -> Result<SceneBatch, DataError> {
+    if frames == 0 || !samples.len().is_multiple_of(frames) {
+        return Err(DataError::Config(format!("{} frames cannot form clips of {frames} frames", samples.len())));
+    }
+    let clips = Some(ClipArrays::of(&samples, frames));
+    Ok(SceneBatch { clips, ..assemble(samples, pad)? })
 }
 
 /// What other cameras on the cars of these frames see: the truth for novel views, one rig per frame.

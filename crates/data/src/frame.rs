@@ -1,8 +1,10 @@
 //! The neutral records every reader fills: one instant of one vehicle, without pixels until asked.
 
 use std::ops::Range;
+use std::sync::Arc;
 
-use geometry::{BevGrid, Box3d, Camera, CameraRig, Intrinsics, Lens, RigCamera, Rigid};
+use geometry::{BevGrid, Box3d, Camera, CameraRig, ImageEdit, Intrinsics, Lens, RigCamera, Rigid};
+use image::RgbImage;
 
 use crate::{DataError, ImageSource, ObjectClass, caption};
 
@@ -60,6 +62,17 @@ impl View {
     /// 0.4 m on real data, because the car moves between the exposures of its cameras.
     pub fn ref_ego_from_cam(&self, world_from_ref_ego: &Rigid) -> Rigid {
         world_from_ref_ego.inverse() * self.world_from_ego * self.ego_from_cam
+    }
+
+    /// The same camera with another picture in memory, such as a generated one: pinhole, the view's whole image plane at the size of
+    /// `picture`. A mask does not outlive its picture.
+    #[must_use]
+    pub fn with_picture(&self, picture: RgbImage) -> Self {
+        let size = picture.dimensions();
+        let raw = &self.intrinsics;
+        let intrinsics = ImageEdit::identity(raw.width, raw.height).resize(size.0, size.1).intrinsics(raw);
+        let image = Some(ImageSource::Memory { picture: Arc::new(picture), size });
+        Self { image, mask: None, intrinsics, lens: Lens::Pinhole, ..self.clone() }
     }
 
     /// The static part.

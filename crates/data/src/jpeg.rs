@@ -1,5 +1,9 @@
 //! Strict JPEG decoding: the size comes from the frame header before any pixel buffer exists, and a picture that ends early or is
 //! damaged inside is refused instead of being filled up with grey.
+//!
+//! Pictures are decoded whole, also for a network that sees a twentieth of their pixels: most of the time goes into Huffman codes, which
+//! a decoder of half size must read as well, and the one in pure Rust takes a scan that ends early for a whole one.
+//! `benches/RESULTS.md` has the figures.
 
 use std::path::Path;
 
@@ -84,11 +88,11 @@ fn next_marker(bytes: &[u8], mut at: usize) -> Option<(u8, usize)> {
 /// More than the decoder's bit buffer of eight bytes.
 const READ_AHEAD: usize = 16;
 
-/// All pixels of a complete, sound JPEG as RGB.
+/// All pixels of a complete, sound JPEG as RGB, in the memory of `pixels`, whose content is lost.
 ///
 /// # Errors
 /// [`DataError::Image`] for anything the format forbids, [`DataError::ImageSize`] when the frame header differs from `want`.
-pub(crate) fn decode(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbImage, DataError> {
+pub(crate) fn decode(bytes: &[u8], want: (u32, u32), path: &Path, mut pixels: Vec<u8>) -> Result<RgbImage, DataError> {
     let bad = |why: String| DataError::Image { why, path: path.to_owned() };
     let outline = outline(bytes, false).map_err(bad)?;
     if outline.size != want {
@@ -107,8 +111,13 @@ pub(crate) fn decode(bytes: &[u8], want: (u32, u32), path: &Path) -> Result<RgbI
         .jpeg_set_out_colorspace(ColorSpace::RGB);
     let mut decoder =
         zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(padded.as_deref().unwrap_or(bytes)), options);
-    let pixels = decoder.decode().map_err(|error| bad(error.to_string()))?;
-    let got = pixels.len();
-    RgbImage::from_raw(want.0, want.1, pixels)
-        .ok_or_else(|| bad(format!("the decoder returned {got} bytes for {}x{} RGB pixels", want.0, want.1)))
+    decoder.decode_headers().map_err(|error| bad(error.to_string()))?;
+    let size = want.0 as usize * want.1 as usize * 3;
+    if decoder.output_buffer_size() != Some(size) {
+        return Err(bad(format!("the decoder would not return {}x{} RGB pixels", want.0, want.1)));
+    }
+    pixels.clear();
+    pixels.resize(size, 0);
+    decoder.decode_into(&mut pixels).map_err(|error| bad(error.to_string()))?;
+    RgbImage::from_raw(want.0, want.1, pixels).ok_or_else(|| bad("the decoder returned another size".to_owned()))
 }

@@ -27,7 +27,7 @@ pub mod occupancy;
 mod parquet_file;
 mod pass;
 mod permutation;
-pub mod pickle;
+mod polygon;
 mod procedural;
 mod procedural_cache;
 mod registry;
@@ -37,7 +37,7 @@ mod seeding;
 mod staging;
 pub mod store;
 pub mod taxonomy;
-mod tfrecord;
+pub mod tfrecord;
 mod undistort;
 pub mod waymo;
 mod waymo_writer;
@@ -48,7 +48,7 @@ pub use argoverse2_writer::{
     Argoverse2Log, Argoverse2Manifest, Argoverse2WriterConfig, CategoryRule, ManifestLog, write_argoverse2,
 };
 pub use augment::{AugmentConfig, ColorJitter, RigMotion};
-pub use batch::{PadViews, SceneBatch, ViewArrays, assemble, novel_targets};
+pub use batch::{ClipArrays, PadViews, SceneBatch, ViewArrays, assemble, assemble_clips, novel_targets};
 pub use check::{BatchMemory, CheckOptions, CheckReport, batch_memory, check, check_all};
 pub use clip::{Clip, ClipConfig, ClipMode, Clips};
 pub use embedded::EmbeddedPicture;

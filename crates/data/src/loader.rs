@@ -1,6 +1,6 @@
 //! Batches from worker threads, in an order that does not depend on them.
 //!
-//! Each sample is one task. Tasks are handed out a bounded number of batches ahead; results come back in any order and are put in
+//! Each sample, a frame of a clip too, is one task. Tasks are handed out a bounded number of batches ahead; results come back in any order and are put in
 //! place by their number, so the run is the same for any number of workers. An error stops the run at exactly the batch that holds it.
 
 use std::collections::BTreeMap;
@@ -15,14 +15,14 @@ use serde::{Deserialize, Serialize};
 use crate::sample::in_frame;
 use crate::{
     AugmentConfig, DataError, FrameId, ImageSize, Mixture, PadViews, PoseMode, Sample, SampleOptions, SceneBatch,
-    SceneDataset, assemble,
+    SceneDataset, assemble, assemble_clips,
 };
 
 /// Settings of a [`Loader`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoaderConfig {
-    /// Samples per batch.
+    /// Samples, or clips, per batch.
     pub batch_size: usize,
     /// Worker threads.
     pub workers: usize,
@@ -61,18 +61,21 @@ impl Default for LoaderConfig {
     }
 }
 
-type Loaded = (u64, Result<Sample, DataError>);
+/// Item of the run and number of its frame.
+type Place = (u64, usize);
+type Loaded = (Place, Result<Sample, DataError>);
 
 /// Hands out the batches of a [`Mixture`] one after another, without end.
 pub struct Loader {
     config: LoaderConfig,
     /// `None` once the loader shuts down.
-    tasks: Option<Sender<u64>>,
+    tasks: Option<Sender<Place>>,
     results: Receiver<Loaded>,
     /// Results that came before their turn.
-    early: BTreeMap<u64, Result<Sample, DataError>>,
-    /// Next item to hand to a worker.
-    next_task: u64,
+    early: BTreeMap<Place, Result<Sample, DataError>>,
+    /// Next item to hand to the workers.
+    next_item: u64,
+    mixture: Arc<Mixture>,
     position: u64,
     failed: bool,
     stop: Arc<AtomicBool>,
@@ -105,13 +108,15 @@ impl Loader {
         let (outbox, results) = unbounded();
         let stop = Arc::new(AtomicBool::new(false));
         let options = SampleOptions { size: config.size, pose_mode: config.pose_mode };
-        let work = Arc::new(Work { mixture, augment: config.augment.clone(), options, seed: config.seed });
-        let next_task = start * config.batch_size as u64;
+        let work =
+            Arc::new(Work { mixture: mixture.clone(), augment: config.augment.clone(), options, seed: config.seed });
+        let next_item = start * config.batch_size as u64;
         let mut loader = Self {
             tasks: Some(tasks),
             results,
             early: BTreeMap::new(),
-            next_task,
+            next_item,
+            mixture,
             position: start,
             failed: false,
             stop,
@@ -136,7 +141,7 @@ impl Loader {
         self.position
     }
 
-    /// The next batch; waits until its last sample is ready.
+    /// The next batch, of clips where the mixture is one of clips; waits until its last sample is ready.
     ///
     /// # Errors
     /// [`DataError::Frame`] for the first sample of this batch that cannot be loaded. The position stays, and every later call fails:
@@ -149,7 +154,10 @@ impl Loader {
             )));
         }
         self.hand_out();
-        let batch = self.collect().and_then(|samples| assemble(samples, self.config.pad_views));
+        let batch = self.collect().and_then(|samples| match self.mixture.has_clips() {
+            true => assemble_clips(samples, self.clip_frames(), self.config.pad_views),
+            false => assemble(samples, self.config.pad_views),
+        });
         match batch {
             Ok(_) => self.position += 1,
             Err(_) => {
@@ -164,19 +172,33 @@ impl Loader {
     fn hand_out(&mut self) {
         let end = (self.position + 1 + self.config.prefetch as u64) * self.config.batch_size as u64;
         if let Some(tasks) = &self.tasks {
-            while self.next_task < end && tasks.send(self.next_task).is_ok() {
-                self.next_task += 1;
+            for item in self.next_item..end {
+                for at in 0..self.mixture.item_frames(item) {
+                    // Workers end only with the loader.
+                    let _ = tasks.send((item, at));
+                }
             }
         }
+        self.next_item = self.next_item.max(end);
+    }
+
+    fn first_item(&self) -> u64 {
+        self.position * self.config.batch_size as u64
+    }
+
+    /// Frames of each clip of the batch at `position`.
+    fn clip_frames(&self) -> usize {
+        self.mixture.item_frames(self.first_item())
     }
 
     /// The samples of the batch at `position`, in order.
     fn collect(&mut self) -> Result<Vec<Sample>, DataError> {
-        let first = self.position * self.config.batch_size as u64;
-        let mut samples = Vec::with_capacity(self.config.batch_size);
-        for item in first..first + self.config.batch_size as u64 {
+        let (first, frames) = (self.first_item(), self.clip_frames());
+        let items = first..first + self.config.batch_size as u64;
+        let mut samples = Vec::with_capacity(self.config.batch_size * frames);
+        for place in items.flat_map(|item| (0..frames).map(move |at| (item, at))) {
             let loaded = loop {
-                if let Some(loaded) = self.early.remove(&item) {
+                if let Some(loaded) = self.early.remove(&place) {
                     break loaded;
                 }
                 match self.results.recv() {
@@ -229,31 +251,33 @@ impl LoaderConfig {
 }
 
 impl Work {
-    fn run(&self, tasks: &Receiver<u64>, outbox: &Sender<Loaded>, stop: &AtomicBool) {
-        for item in tasks {
+    fn run(&self, tasks: &Receiver<Place>, outbox: &Sender<Loaded>, stop: &AtomicBool) {
+        for place in tasks {
             if stop.load(Ordering::Relaxed) {
                 return;
             }
             // A worker that died would leave its batch waiting for ever, so a panic becomes the error of its sample.
-            let loaded = catch_unwind(AssertUnwindSafe(|| self.load(item)));
-            let loaded = loaded.unwrap_or_else(|panic| Err(self.panicked(item, panic.as_ref())));
-            if outbox.send((item, loaded)).is_err() {
+            let loaded = catch_unwind(AssertUnwindSafe(|| self.load(place)));
+            let loaded = loaded.unwrap_or_else(|panic| Err(self.panicked(place, panic.as_ref())));
+            if outbox.send((place, loaded)).is_err() {
                 return;
             }
         }
     }
 
-    fn load(&self, item: u64) -> Result<Sample, DataError> {
-        let (dataset, index) = self.mixture.item(item);
-        let mut sample = load_sample(self.mixture.datasets()[dataset].as_ref(), dataset, index, &self.options)?;
+    /// The frames of a clip are changed alike: the changes follow from the item's number.
+    fn load(&self, (item, at): Place) -> Result<Sample, DataError> {
+        let (number, dataset, index) = self.mixture.item_frame(item, at)?;
+        let mut sample = load_sample(dataset, number, index, &self.options)?;
         self.augment.apply(&mut sample, self.seed, item);
         Ok(sample)
     }
 
-    fn panicked(&self, item: u64, panic: &(dyn std::any::Any + Send)) -> DataError {
+    fn panicked(&self, (item, at): Place, panic: &(dyn std::any::Any + Send)) -> DataError {
         let text = panic.downcast_ref::<String>().map(String::as_str);
         let why = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message");
-        let (dataset, index) = self.mixture.item(item);
+        let frame = self.mixture.item_frame(item, at).map(|(number, _, index)| (number, index));
+        let (dataset, index) = frame.unwrap_or_else(|_| self.mixture.item(item));
         in_frame(&nameless(dataset, index), DataError::Config(format!("the loader thread panicked: {why}")))
     }
 }

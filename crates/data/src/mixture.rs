@@ -2,6 +2,7 @@
 //! alone.
 
 mod class_balance;
+mod clip_starts;
 mod config;
 mod plan;
 mod walk;
@@ -10,11 +11,12 @@ use std::sync::Arc;
 
 pub use config::{FrameSampling, MixtureConfig, MixtureOrder, MixtureWeights};
 
+use clip_starts::ClipStarts;
 use plan::{Group, by_dataset, by_views, share_out};
 
 use crate::permutation::Permutation;
 use crate::seeding::{Purpose, rng};
-use crate::{DataError, SceneDataset};
+use crate::{Clips, DataError, SceneDataset};
 
 /// Several datasets blended into one endless, shuffled list.
 ///
@@ -22,6 +24,8 @@ use crate::{DataError, SceneDataset};
 /// within one pass no frame repeats (unless draws are class-balanced), whatever the dataset's weight.
 pub struct Mixture {
     datasets: Vec<Arc<dyn SceneDataset>>,
+    /// For a mixture of clips, those of each dataset.
+    clips: Vec<Arc<Clips>>,
     groups: Vec<Group>,
     /// Items per block.
     block_len: u64,
@@ -56,7 +60,7 @@ impl Mixture {
             return refuse("the batch size must be at least 1".into());
         }
         if let Some(empty) = datasets.iter().position(|d| d.is_empty()) {
-            return refuse(format!("dataset {empty} of the mixture has no frames"));
+            return refuse(format!("dataset {empty} of the mixture has no frames or clips"));
         }
         let weights = config.weights.of(&datasets)?;
         let draws = config.frames.expected_draws(&datasets)?;
@@ -70,7 +74,59 @@ impl Mixture {
         };
         let frames: u64 = datasets.iter().map(|d| d.len() as u64).sum();
         let groups = share_out(planned, frames.div_ceil(block_len), block_len)?;
-        Ok(Self { datasets, groups, block_len, seed })
+        Ok(Self { datasets, clips: Vec::new(), groups, block_len, seed })
+    }
+
+    /// Blends clips: an item is a clip, and what [`Mixture::new`] says about frames holds for them. A clip counts for the views of its
+    /// first frame and the classes of all its frames.
+    ///
+    /// The clips of one batch have one length. Datasets whose clips differ in length therefore need [`MixtureOrder::Homogeneous`].
+    ///
+    /// # Errors
+    /// As [`Mixture::new`], and [`DataError::Config`] for clips of different lengths in any other order.
+    pub fn of_clips(
+        clips: Vec<Arc<Clips>>,
+        config: &MixtureConfig,
+        batch_size: usize,
+        seed: u64,
+    ) -> Result<Self, DataError> {
+        let mut lengths: Vec<usize> = clips.iter().map(|clips| clips.config().frames).collect();
+        lengths.sort_unstable();
+        lengths.dedup();
+        if lengths.len() > 1 && config.order != MixtureOrder::Homogeneous {
+            return Err(DataError::Config(format!(
+                "clips of {lengths:?} frames cannot share a batch; set mixture.order to \"homogeneous\""
+            )));
+        }
+        let starts = clips.iter().map(|clips| Arc::new(ClipStarts(clips.clone())) as Arc<dyn SceneDataset>).collect();
+        Ok(Self { clips, ..Self::new(starts, config, batch_size, seed)? })
+    }
+
+    /// True for a mixture of clips.
+    pub fn has_clips(&self) -> bool {
+        !self.clips.is_empty()
+    }
+
+    /// Frames of item `k`: 1, or the length of the clip it is.
+    pub fn item_frames(&self, k: u64) -> usize {
+        if self.clips.is_empty() { 1 } else { self.clips[self.item(k).0].config().frames }
+    }
+
+    /// Dataset number, dataset and frame index of frame `at` of item `k`.
+    ///
+    /// # Errors
+    /// [`DataError::Config`] where the item has fewer frames.
+    pub(crate) fn item_frame(&self, k: u64, at: usize) -> Result<(usize, &dyn SceneDataset, usize), DataError> {
+        let (number, index) = self.item(k);
+        let none = || DataError::Config(format!("item {k} of the mixture has no frame {at}"));
+        match self.clips.get(number) {
+            Some(clips) => {
+                let frame = clips.frame_indices(index)?.get(at).copied().ok_or_else(none)?;
+                Ok((number, clips.dataset().as_ref(), frame))
+            }
+            None if at == 0 => Ok((number, self.datasets[number].as_ref(), index)),
+            None => Err(none()),
+        }
     }
 
     /// Items per epoch.
@@ -90,7 +146,7 @@ impl Mixture {
         self.block_len
     }
 
-    /// The datasets in order.
+    /// The datasets in order; those of clips have one frame for each clip, its first.
     pub fn datasets(&self) -> &[Arc<dyn SceneDataset>] {
         &self.datasets
     }
@@ -100,7 +156,7 @@ impl Mixture {
         self.datasets.iter().map(|d| d.max_views()).max().unwrap_or(0)
     }
 
-    /// Dataset and frame of item `k` of the run; `k` counts on across epochs.
+    /// Dataset and frame (or clip) of item `k` of the run; `k` counts on across epochs.
     pub fn item(&self, k: u64) -> (usize, usize) {
         let (block, within) = (k / self.block_len, k % self.block_len);
         let (epoch, slot) = (block / self.epoch_blocks(), block % self.epoch_blocks());

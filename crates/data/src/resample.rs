@@ -8,10 +8,20 @@ use image::RgbImage;
 
 use crate::DataError;
 
-/// The weighted source indices of one output index.
+/// The weighted source indices of every output index of an axis: equally many for each, padded with weights of zero, so that the loops
+/// over them never change their length.
 struct Taps {
-    first: usize,
+    /// First source index of each output index.
+    first: Vec<usize>,
+    /// `count` weights for each output index.
     weights: Vec<f32>,
+    count: usize,
+}
+
+impl Taps {
+    fn iter(&self) -> impl Iterator<Item = (usize, &[f32])> {
+        self.first.iter().copied().zip(self.weights.chunks_exact(self.count))
+    }
 }
 
 /// The edited picture.
@@ -25,45 +35,92 @@ pub(crate) fn resample(source: &RgbImage, edit: &ImageEdit) -> Result<RgbImage, 
     if !plain || !scaled || !m[0][2].is_finite() || !m[1][2].is_finite() {
         return Err(DataError::Config(format!("an image edit may only scale, shift and mirror, but is {m:?}")));
     }
+    let mut output = RgbImage::new(edit.width, edit.height);
+    if source.is_empty() || output.is_empty() {
+        return Ok(output);
+    }
     let columns = taps(m[0][0], m[0][2], source.width(), edit.width);
     let rows = taps(m[1][1], m[1][2], source.height(), edit.height);
     let (source_stride, stride) = (source.width() as usize * 3, edit.width as usize * 3);
-    let mut output = RgbImage::new(edit.width, edit.height);
-    let mut line = vec![0.0f32; source_stride];
-    for (row, target) in rows.iter().zip(output.chunks_exact_mut(stride.max(1))) {
-        line.fill(0.0);
-        for (i, weight) in row.weights.iter().enumerate() {
-            let start = (row.first + i) * source_stride;
-            let pixels = &source.as_raw()[start..start + source_stride];
-            line.iter_mut().zip(pixels).for_each(|(sum, value)| *sum += weight * f32::from(*value));
-        }
-        for (column, target) in columns.iter().zip(target.chunks_exact_mut(3)) {
-            let mut sum = [0.0f32; 3];
-            for (weight, pixel) in column.weights.iter().zip(line[column.first * 3..].chunks_exact(3)) {
-                sum.iter_mut().zip(pixel).for_each(|(s, v)| *s += weight * v);
-            }
-            target.iter_mut().zip(sum).for_each(|(t, s)| *t = (s + 0.5).clamp(0.0, 255.0) as u8);
-        }
+    // One value more than the pixels have, so that four values can be read at the last one.
+    let mut line = vec![0.0f32; source_stride + 1];
+    let mut sums = vec![0u16; source_stride];
+    for ((first, weights), target) in rows.iter().zip(output.chunks_exact_mut(stride)) {
+        let pixels = &source.as_raw()[first * source_stride..][..weights.len() * source_stride];
+        weigh_rows(pixels, weights, &mut line[..source_stride], &mut sums);
+        weigh_columns(&line, &columns, target);
     }
     Ok(output)
 }
 
+/// As many bytes as a u16 can sum.
+const MOST_ROWS: usize = 257;
+
+/// The weighted sum of rows of bytes. The rows inside a shrunk pixel all weigh the same: their bytes are summed before they are
+/// weighed, eight at a time instead of four.
+fn weigh_rows(rows: &[u8], weights: &[f32], line: &mut [f32], sums: &mut [u16]) {
+    let stride = line.len();
+    let start = weights.iter().take_while(|weight| **weight == 0.0).count();
+    let end = weights.iter().rposition(|weight| *weight != 0.0).map_or(start, |last| last + 1);
+    let (rows, weights) = (&rows[start * stride..end * stride], &weights[start..end]);
+    let alike = |inner: &[f32]| inner.len() <= MOST_ROWS && inner.windows(2).all(|pair| pair[0] == pair[1]);
+    match weights {
+        [first, inner @ .., last] if !inner.is_empty() && alike(inner) => {
+            let (first_row, rest) = rows.split_at(stride);
+            let (inner_rows, last_row) = rest.split_at(inner.len() * stride);
+            sums.fill(0);
+            for row in inner_rows.chunks_exact(stride) {
+                sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += u16::from(*value));
+            }
+            for (((out, a), sum), b) in line.iter_mut().zip(first_row).zip(sums).zip(last_row) {
+                *out = first * f32::from(*a) + inner[0] * f32::from(*sum) + last * f32::from(*b);
+            }
+        }
+        _ => {
+            line.fill(0.0);
+            for (row, weight) in rows.chunks_exact(stride).zip(weights) {
+                line.iter_mut().zip(row).for_each(|(sum, value)| *sum += weight * f32::from(*value));
+            }
+        }
+    }
+}
+
+/// The weighted sums of RGB triples, rounded. A fourth value is summed along with each triple and dropped: four fill a register.
+fn weigh_columns(line: &[f32], columns: &Taps, target: &mut [u8]) {
+    for ((first, weights), target) in columns.iter().zip(target.chunks_exact_mut(3)) {
+        let mut sum = [0.5f32; 4];
+        for (weight, values) in weights.iter().zip(line[first * 3..].windows(4).step_by(3)) {
+            sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += weight * value);
+        }
+        target.iter_mut().zip(sum).for_each(|(target, sum)| *target = sum as u8);
+    }
+}
+
 /// Weights along one axis: output pixel i covers the source interval between `(i - shift) / scale` and `(i + 1 - shift) / scale`.
-fn taps(scale: f64, shift: f64, source: u32, output: u32) -> Vec<Taps> {
-    (0..output)
+fn taps(scale: f64, shift: f64, source: u32, output: u32) -> Taps {
+    let spans: Vec<(usize, Vec<f32>)> = (0..output)
         .map(|i| {
             let (a, b) = ((f64::from(i) - shift) / scale, (f64::from(i) + 1.0 - shift) / scale);
             let (low, high) = (a.min(b), a.max(b));
             if high - low >= 1.0 - 1e-9 { area(low, high, source) } else { linear(0.5 * (low + high), source) }
         })
-        .collect()
+        .collect();
+    let count = spans.iter().map(|span| span.1.len()).max().unwrap_or(0).max(1);
+    let mut taps = Taps { first: Vec::new(), weights: vec![0.0; count * spans.len()], count };
+    for ((first, span), weights) in spans.into_iter().zip(taps.weights.chunks_exact_mut(count)) {
+        // Padding behind the last source index would lead outside, so it stands in front there.
+        let padded = first.min(source as usize - count);
+        weights[first - padded..][..span.len()].copy_from_slice(&span);
+        taps.first.push(padded);
+    }
+    taps
 }
 
 /// Mean over an interval; the part outside the picture counts as black.
-fn area(low: f64, high: f64, source: u32) -> Taps {
+fn area(low: f64, high: f64, source: u32) -> (usize, Vec<f32>) {
     let (inside_low, inside_high) = (low.max(0.0), high.min(f64::from(source)));
     if inside_high <= inside_low {
-        return Taps { first: 0, weights: Vec::new() };
+        return (0, Vec::new());
     }
     let first = inside_low.floor() as usize;
     let last = (inside_high.ceil() as usize).min(source as usize);
@@ -73,19 +130,19 @@ fn area(low: f64, high: f64, source: u32) -> Taps {
             (covered / (high - low)) as f32
         })
         .collect();
-    Taps { first, weights }
+    (first, weights)
 }
 
 /// Between the two nearest pixel centres; the outer half of a border pixel keeps that pixel's value.
-fn linear(center: f64, source: u32) -> Taps {
+fn linear(center: f64, source: u32) -> (usize, Vec<f32>) {
     if source == 0 || center < 0.0 || center > f64::from(source) {
-        return Taps { first: 0, weights: Vec::new() };
+        return (0, Vec::new());
     }
     let position = (center - 0.5).clamp(0.0, f64::from(source - 1));
     let first = (position.floor() as usize).min((source as usize).saturating_sub(2));
     let amount = (position - first as f64) as f32;
     let weights = if source == 1 { vec![1.0] } else { vec![1.0 - amount, amount] };
-    Taps { first, weights }
+    (first, weights)
 }
 
 #[cfg(test)]
@@ -153,6 +210,37 @@ mod tests {
             let want = if inside { *source.get_pixel(x - 4, y - 2) } else { Rgb([0, 0, 0]) };
             assert_eq!(*pixel, want, "at ({x}, {y})");
         }
+    }
+
+    /// Share of source pixel `k` in the interval an output pixel covers.
+    fn share(scale: f64, shift: f64, output: u32, k: u32) -> f64 {
+        let ends = [0.0, 1.0].map(|end| (f64::from(output) + end - shift) / scale);
+        let (low, high) = (ends[0].min(ends[1]), ends[0].max(ends[1]));
+        (high.min(f64::from(k) + 1.0) - low.max(f64::from(k))).max(0.0) / (high - low)
+    }
+
+    #[test]
+    fn shrinking_by_any_factor_is_the_area_average_of_every_pixel() {
+        let id = ImageEdit::identity(70, 300);
+        let source = RgbImage::from_fn(70, 300, |x, y| Rgb([0, 1, 2].map(|c| (x * 97 + y * 193 + c * 71) as u8)));
+        // One output row covers 300 source rows, more than a u16 can sum; other edits shift, crop and mirror.
+        let edits =
+            [id.resize(9, 1), id.resize(69, 299), id.resize(13, 40).crop(-2, 3, 17, 30).flip(), id.resize(70, 7)];
+        for edit in edits {
+            let edited = resample(&source, &edit).unwrap();
+            let m = edit.img_from_raw.transpose().to_cols_array_2d();
+            for (x, y, pixel) in edited.enumerate_pixels() {
+                let mut want = [0.0; 3];
+                for (k, l, value) in source.enumerate_pixels() {
+                    let weight = share(m[0][0], m[0][2], x, k) * share(m[1][1], m[1][2], y, l);
+                    (0..3).for_each(|c| want[c] += weight * f64::from(value.0[c]));
+                }
+                for (got, want) in pixel.0.iter().zip(want) {
+                    assert!((f64::from(*got) - want).abs() <= 0.501, "{edit:?} at ({x}, {y}): {got} for {want}");
+                }
+            }
+        }
+        assert_eq!(resample(&source, &id.crop(500, 0, 5, 5)).unwrap(), RgbImage::new(5, 5));
     }
 
     #[test]

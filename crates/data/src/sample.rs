@@ -54,6 +54,8 @@ pub struct Sample {
     pub id: FrameId,
     /// Reference instant.
     pub timestamp_ns: i64,
+    /// The car at the reference instant.
+    pub world_from_ego: Rigid,
     /// The dataset's own words.
     pub text: Option<String>,
     /// What is encoded; augmentation changes it.
@@ -91,14 +93,16 @@ impl Sample {
         Ok(Self {
             id: frame.id.clone(),
             timestamp_ns: frame.timestamp_ns,
+            world_from_ego: frame.world_from_ego,
             text: frame.scene_text.clone(),
             input: views.clone(),
             target: views,
         })
     }
 
-    /// Redefines the ego frame for all cameras: `ego_from_cam ← new_from_ego · ego_from_cam`.
+    /// Redefines the ego frame, for all cameras and for the car's own pose: `ego_from_cam ← new_from_ego · ego_from_cam`.
     pub fn move_rig(&mut self, new_from_ego: &Rigid) {
+        self.world_from_ego = self.world_from_ego * new_from_ego.inverse();
         for view in self.input.iter_mut().chain(&mut self.target) {
             view.ego_from_cam = *new_from_ego * view.ego_from_cam;
         }
@@ -188,9 +192,9 @@ fn rows(linear: &DMat3, offset: DVec3) -> [[f64; 4]; 3] {
 fn planar(image: &RgbImage) -> Vec<f32> {
     let plane = image.width() as usize * image.height() as usize;
     let mut out = vec![0.0; 3 * plane];
-    for (i, pixel) in image.pixels().enumerate() {
-        for (channel, value) in pixel.0.into_iter().enumerate() {
-            out[channel * plane + i] = f32::from(value) / 255.0;
+    for (channel, plane) in out.chunks_exact_mut(plane.max(1)).enumerate() {
+        for (value, pixel) in plane.iter_mut().zip(image.as_raw().chunks_exact(3)) {
+            *value = f32::from(pixel[channel]) / 255.0;
         }
     }
     out

@@ -15,7 +15,7 @@ const FOOTER: u64 = 4;
 
 /// Where a record's payload lies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct RecordSpan {
+pub struct RecordSpan {
     /// First byte of the payload.
     pub offset: u64,
     /// Bytes of the payload.
@@ -27,7 +27,7 @@ pub(crate) struct RecordSpan {
 ///
 /// # Errors
 /// [`DataError::Checksum`] for a wrong length, [`DataError::Truncated`] for a file that ends inside a record, and what `each` returns.
-pub(crate) fn index(
+pub fn index(
     file: &StoredFile,
     peek: u64,
     mut each: impl FnMut(RecordSpan, &[u8]) -> Result<(), DataError>,
@@ -58,7 +58,7 @@ pub(crate) fn index(
 ///
 /// # Errors
 /// [`DataError::Checksum`], [`DataError::Truncated`] for a file that has shrunk since it was indexed.
-pub(crate) fn payload(file: &StoredFile, span: RecordSpan) -> Result<Bytes, DataError> {
+pub fn payload(file: &StoredFile, span: RecordSpan) -> Result<Bytes, DataError> {
     let mut bytes = Bytes::from(file.read_at(span.offset, span.length.saturating_add(FOOTER))?);
     let checksum = bytes.split_off(bytes.len().saturating_sub(FOOTER as usize));
     if masked_crc32c(&bytes).to_le_bytes() != *checksum {
@@ -68,7 +68,7 @@ pub(crate) fn payload(file: &StoredFile, span: RecordSpan) -> Result<Bytes, Data
 }
 
 /// The format stores checksums rotated and shifted, so that a checksum of data that holds checksums stays meaningful.
-pub(crate) fn masked_crc32c(bytes: &[u8]) -> u32 {
+pub fn masked_crc32c(bytes: &[u8]) -> u32 {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 

@@ -24,7 +24,7 @@ pub(crate) fn load_pinhole(source: &ImageSource, view: &View, edit: &ImageEdit) 
             let (snapshot, world_from_cam) = (snapshot.clone(), *world_from_cam);
             ImageSource::Rendered { snapshot, camera: camera(Lens::Pinhole)?, world_from_cam }.load(edit)
         }
-        ImageSource::File { .. } | ImageSource::Embedded { .. } => {
+        ImageSource::File { .. } | ImageSource::Embedded { .. } | ImageSource::Memory { .. } => {
             let fine = fine_edit(&view.intrinsics, edit);
             Ok(remap(&source.load(&fine)?, &fine, &camera(view.lens)?, edit))
         }

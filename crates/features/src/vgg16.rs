@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use burn::tensor::activation::relu;
-use burn::tensor::module::{conv2d, max_pool2d};
-use burn::tensor::ops::{ConvOptions, MaxPoolOptions};
+use burn::tensor::module::max_pool2d;
+use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use nn::weights::{Mismatch, WeightError, WeightFile};
 use serde::{Deserialize, Serialize};
@@ -89,7 +89,7 @@ pub struct Vgg16 {
 }
 
 impl Vgg16 {
-    /// Loads a safetensors file in one of two layouts, told apart by the names: torchvision's
+    /// Loads a safetensors or torch file in one of two layouts, told apart by the names: torchvision's
     /// (`features.{0,2,5,…}.{weight,bias}`, [`Preprocessing::Torchvision`]; a classifier beside them is not read) or
     /// the Oxford release's (`block{b}_conv{c}.{weight,bias}`, [`Preprocessing::Caffe`]).
     ///
@@ -192,7 +192,7 @@ impl Conv {
         if x.is_autodiff() {
             (weight, bias) = (Tensor::from_inner(weight), Tensor::from_inner(bias));
         }
-        relu(conv2d(x, weight, Some(bias), ConvOptions::new([1, 1], [1, 1], [1, 1], 1)))
+        relu(ops::conv2d(x, weight, Some(bias), [1; 2], [1; 2]))
     }
 }
 

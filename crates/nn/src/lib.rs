@@ -4,8 +4,10 @@ pub mod golden;
 mod init;
 pub mod layout;
 mod linear;
+pub mod lora;
 mod norm;
 mod position;
+pub mod segments;
 mod transformer;
 pub mod weights;
 

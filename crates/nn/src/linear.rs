@@ -4,11 +4,10 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::module::{conv2d, conv3d};
-use burn::tensor::ops::ConvOptions;
 
 use crate::Init;
 use crate::layout::{blocks_from_volume, image_from_patches, patches_from_image};
+use crate::lora::Adapters;
 
 /// `y = x Wᵀ + b` over the last axis.
 #[derive(Module, Debug)]
@@ -17,6 +16,8 @@ pub struct Linear {
     pub weight: Param<Tensor<2>>,
     /// `[out]`
     pub bias: Option<Param<Tensor<1>>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 /// Whether an affine layer adds a learned offset.
@@ -38,41 +39,28 @@ impl Linear {
     /// Weights and bias U(±1/√in).
     pub fn new(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
         let bound = 1.0 / (d_in as f64).sqrt();
-        Self { weight: init.uniform([d_out, d_in], bound), bias: bias.init(d_out, bound, init) }
+        let weight = init.uniform([d_out, d_in], bound);
+        Self { weight, bias: bias.init(d_out, bound, init), lora: Adapters::none() }
     }
 
     /// Weights and bias 0: the last layer of a residual branch that starts as the identity.
     pub fn zeros(d_in: usize, d_out: usize, bias: Bias, init: &mut Init) -> Self {
         let bias = (bias == Bias::With).then(|| init.constant([d_out], 0.0));
-        Self { weight: init.constant([d_out, d_in], 0.0), bias }
+        Self { weight: init.constant([d_out, d_in], 0.0), bias, lora: Adapters::none() }
     }
 
     /// Passes its input through unchanged at the start; no bias.
     pub fn identity(width: usize, init: &mut Init) -> Self {
-        Self { weight: init.diagonal(width), bias: None }
+        Self { weight: init.diagonal(width), bias: None, lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - x: `[.., in]`
     /// - output: `[.., out]`
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        affine(x, self.weight.val().transpose(), self.bias.as_ref().map(Param::val))
+        let matrix = self.lora.matrix(&self.weight);
+        self.lora.add_to_rows(x, |x| ops::linear(x, matrix, self.bias.as_ref().map(Param::val)))
     }
-}
-
-/// `x M + b` with all leading axes folded into one product.
-fn affine<const D: usize>(x: Tensor<D>, matrix: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<D> {
-    let mut dims = x.dims();
-    let [d_in, d_out] = matrix.dims();
-    assert_eq!(dims[D - 1], d_in, "last axis of {dims:?} must be {d_in}");
-    let rows = dims[..D - 1].iter().product::<usize>();
-    let y = x.reshape([rows, d_in]).matmul(matrix);
-    let y = match bias {
-        Some(bias) => y + bias.unsqueeze::<2>(),
-        None => y,
-    };
-    dims[D - 1] = d_out;
-    y.reshape(dims)
 }
 
 /// Convolution whose stride equals its kernel: one matrix product over patches.
@@ -82,23 +70,25 @@ pub struct PatchConv2d {
     pub weight: Param<Tensor<4>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 impl PatchConv2d {
     /// U(±1/√fan_in), fan_in = in·k².
     pub fn new(c_in: usize, c_out: usize, patch: usize, init: &mut Init) -> Self {
         let bound = 1.0 / ((c_in * patch * patch) as f64).sqrt();
-        Self { weight: init.uniform([c_out, c_in, patch, patch], bound), bias: init.uniform([c_out], bound) }
+        let weight = init.uniform([c_out, c_in, patch, patch], bound);
+        Self { weight, bias: init.uniform([c_out], bound), lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - image: `[B, in, h·k, w·k]`
     /// - output: `[B, h, w, out]`, channels last
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
-        let weight = self.weight.val();
-        let [c_out, c_in, k, _] = weight.dims();
-        let matrix = weight.reshape([c_out, c_in * k * k]).transpose();
-        affine(patches_from_image(image, k), matrix, Some(self.bias.val()))
+        let k = self.weight.dims()[3];
+        let matrix = self.lora.matrix(&self.weight);
+        self.lora.add_to_rows(patches_from_image(image, k), |x| ops::linear(x, matrix, Some(self.bias.val())))
     }
 }
 
@@ -129,7 +119,7 @@ impl PatchDeconv2d {
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let weight = self.weight.val();
         let [c_in, c_out, k, _] = weight.dims();
-        let patches = affine(x, weight.reshape([c_in, c_out * k * k]), None);
+        let patches = ops::linear(x, weight.reshape([c_in, c_out * k * k]).transpose(), None);
         image_from_patches(patches, k) + self.bias.val().reshape([1, c_out, 1, 1])
     }
 }
@@ -156,8 +146,7 @@ impl PatchConv3d {
     pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
         let weight = self.weight.val();
         let [c_out, c_in, k, _, _] = weight.dims();
-        let matrix = weight.reshape([c_out, c_in * k * k * k]).transpose();
-        affine(blocks_from_volume(volume, k), matrix, Some(self.bias.val()))
+        ops::linear(blocks_from_volume(volume, k), weight.reshape([c_out, c_in * k * k * k]), Some(self.bias.val()))
     }
 }
 
@@ -168,20 +157,25 @@ pub struct Conv3x3 {
     pub weight: Param<Tensor<4>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    /// None unless [`crate::lora::attach`] puts them there.
+    pub lora: Adapters,
 }
 
 impl Conv3x3 {
     /// U(±1/√(9·in)).
     pub fn new(c_in: usize, c_out: usize, init: &mut Init) -> Self {
         let bound = 1.0 / ((c_in * 9) as f64).sqrt();
-        Self { weight: init.uniform([c_out, c_in, 3, 3], bound), bias: init.uniform([c_out], bound) }
+        let weight = init.uniform([c_out, c_in, 3, 3], bound);
+        Self { weight, bias: init.uniform([c_out], bound), lora: Adapters::none() }
     }
 
     /// # Shapes
     /// - image: `[B, in, H, W]`
     /// - output: `[B, out, H, W]`
     pub fn forward(&self, image: Tensor<4>) -> Tensor<4> {
-        conv2d(image, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1, 1], [1, 1], [1, 1], 1))
+        let kernel = self.lora.kernel(&self.weight);
+        let base = |image| ops::conv2d(image, kernel, Some(self.bias.val()), [1; 2], [1; 2]);
+        self.lora.add_to_conv2d(image, ([3; 2], [1; 2], [1; 2]), base)
     }
 }
 
@@ -205,6 +199,6 @@ impl Conv3x3x3 {
     /// - volume: `[B, in, Z, Y, X]`
     /// - output: `[B, out, Z, Y, X]`
     pub fn forward(&self, volume: Tensor<5>) -> Tensor<5> {
-        conv3d(volume, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1; 3], [1; 3], [1; 3], 1))
+        ops::conv3d(volume, self.weight.val(), Some(self.bias.val()), [1; 3], [1; 3])
     }
 }

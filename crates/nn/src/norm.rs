@@ -5,43 +5,44 @@ use burn::tensor::Tensor;
 
 use crate::Init;
 
-/// Layer norm over the last axis with a gain and without a bias.
+/// Layer norm over the last axis with a gain and, where asked for, a bias.
 #[derive(Module, Debug)]
 pub struct LayerNorm {
     /// `[width]`
     pub weight: Param<Tensor<1>>,
+    /// `[width]`
+    pub bias: Option<Param<Tensor<1>>>,
     epsilon: f32,
 }
 
 impl LayerNorm {
-    /// Gains 1.
+    /// Gains 1, no bias.
     pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
-        Self { weight: init.constant([width], 1.0), epsilon }
+        Self { weight: init.constant([width], 1.0), bias: None, epsilon }
+    }
+
+    /// Gains 1, biases 0.
+    pub fn with_bias(width: usize, epsilon: f32, init: &mut Init) -> Self {
+        Self { bias: Some(init.constant([width], 0.0)), ..Self::new(width, epsilon, init) }
     }
 
     /// Shape unchanged.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::layer_norm(x, Some(self.weight.val()), None, self.epsilon)
+        ops::layer_norm(x, Some(self.weight.val()), self.bias.as_ref().map(Param::val), self.epsilon)
     }
 }
 
-/// Root-mean-square norm over the last axis with a gain.
+/// Gains of a root-mean-square norm; [`ops::rotary_attention`] applies them.
 #[derive(Module, Debug)]
 pub struct RmsNorm {
     /// `[width]`
     pub weight: Param<Tensor<1>>,
-    epsilon: f32,
 }
 
 impl RmsNorm {
     /// Gains 1.
-    pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
-        Self { weight: init.constant([width], 1.0), epsilon }
-    }
-
-    /// Shape unchanged.
-    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::rms_norm(x, self.weight.val(), self.epsilon)
+    pub fn new(width: usize, init: &mut Init) -> Self {
+        Self { weight: init.constant([width], 1.0) }
     }
 }
 

@@ -56,8 +56,8 @@ impl RotaryAttention {
         Self {
             qkv: Linear::new(width, 3 * width, Bias::Without, init),
             out: Linear::zeros(width, width, Bias::Without, init),
-            query_norm: RmsNorm::new(width / heads, NORM_EPSILON, init),
-            key_norm: RmsNorm::new(width / heads, NORM_EPSILON, init),
+            query_norm: RmsNorm::new(width / heads, init),
+            key_norm: RmsNorm::new(width / heads, init),
             heads,
         }
     }
@@ -67,14 +67,9 @@ impl RotaryAttention {
     /// - cos, sin: `[1 or H, N, d/2]`
     /// - output: `[B, N, D]`
     pub fn forward(&self, tokens: Tensor<3>, (cos, sin): (Tensor<3>, Tensor<3>)) -> Tensor<3> {
-        let [b, n, width] = tokens.dims();
-        let head = width / self.heads;
-        let qkv = self.qkv.forward(tokens).reshape([b, n, 3, self.heads, head]).permute([2, 0, 3, 1, 4]);
-        let part = |i: usize| qkv.clone().narrow(0, i, 1).reshape([b, self.heads, n, head]);
-        let q = ops::rotary(self.query_norm.forward(part(0)), cos.clone(), sin.clone());
-        let k = ops::rotary(self.key_norm.forward(part(1)), cos, sin);
-        let attended = ops::attention(q, k, part(2), None);
-        self.out.forward(attended.swap_dims(1, 2).reshape([b, n, width]))
+        let gains = [self.query_norm.weight.val(), self.key_norm.weight.val()];
+        let attended = ops::rotary_attention(self.qkv.forward(tokens), gains, [cos, sin], self.heads, NORM_EPSILON);
+        self.out.forward(attended)
     }
 }
 

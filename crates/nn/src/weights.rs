@@ -1,15 +1,19 @@
-//! Named weights: safetensors files, the parameters of a burn module by path and strict loading.
+//! Named weights: safetensors and torch files, the parameters of a burn module by path and strict loading.
 //!
 //! Everything here works on host tensors. A parameter's path is the field names from the root down, joined by dots
 //! (`blocks.3.attn.proj.weight`; the variant's name stands in the path of an enum).
 
+mod element;
 mod error;
 mod file;
 mod params;
+mod safetensors_file;
+mod torch;
 
-pub use error::{Mismatch, WeightError};
-pub use file::{WeightFile, write_safetensors};
+pub use error::{Mismatch, TorchFault, WeightError};
+pub use file::{WeightFile, write_text};
 pub use params::{fill_params, fill_some_params, load_strict, named_params, param_shapes};
+pub use safetensors_file::write_safetensors;
 
 /// A tensor on the host, row-major.
 #[derive(Debug, Clone, PartialEq)]

@@ -12,17 +12,23 @@
 
 mod activation;
 mod attention;
+mod conv;
 mod fused;
+mod linear;
 #[cfg(test)]
 mod noise;
 mod norm;
+mod product;
 mod rotary;
 mod sampling;
 mod softmax;
+mod sums;
 
 pub use activation::{gelu, silu};
-pub use attention::attention;
+pub use attention::{attention, rotary_attention};
+pub use conv::{conv2d, conv3d};
 pub use fused::composed_only;
+pub use linear::linear;
 pub use norm::{group_norm, group_norm_silu, layer_norm, rms_norm};
 pub use rotary::rotary;
 pub use sampling::{
@@ -30,3 +36,4 @@ pub use sampling::{
     grid_sample_3d,
 };
 pub use softmax::softmax;
+pub use sums::{mean_dim, sum_dim};

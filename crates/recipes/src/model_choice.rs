@@ -1,39 +1,107 @@
 //! The `[model]` table of an experiment: a preset, and whatever differs from it.
 
+use std::fmt::Debug;
+
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use stable_diffusion::{UNetConfig, VaeConfig};
 use toml::{Table, Value};
-use vae::{BevVaeConfig, Preset};
+use vae::BevVaeConfig;
 
 use crate::config_file::merge;
 
-/// A preset with overrides. Reads `preset = "tiny"` plus any field of [`BevVaeConfig`]; writes every field.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ModelChoice {
-    /// The sizes it starts from.
-    pub preset: Preset,
-    /// The sizes that result, checked.
-    pub config: BevVaeConfig,
+/// The presets of one kind of network.
+pub trait Sizes: Copy + Debug + PartialEq + Serialize + DeserializeOwned {
+    /// Every size of the network.
+    type Config: Clone + Debug + PartialEq + Serialize + DeserializeOwned;
+
+    /// The preset's sizes.
+    fn config(self) -> Self::Config;
+
+    /// The sizes, if they build a network.
+    ///
+    /// # Errors
+    /// A text that names the size.
+    fn checked(config: Self::Config) -> Result<Self::Config, String>;
 }
 
-impl From<Preset> for ModelChoice {
-    fn from(preset: Preset) -> Self {
+/// A preset with overrides. Reads `preset = "tiny"` plus any field of the network's config; writes every field.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Choice<P: Sizes> {
+    /// The sizes it starts from.
+    pub preset: P,
+    /// The sizes that result, checked.
+    pub config: P::Config,
+}
+
+/// BEV-VAE.
+pub type ModelChoice = Choice<vae::Preset>;
+
+impl Sizes for vae::Preset {
+    type Config = BevVaeConfig;
+
+    fn config(self) -> BevVaeConfig {
+        Self::config(self)
+    }
+
+    fn checked(config: BevVaeConfig) -> Result<BevVaeConfig, String> {
+        config.checked().map_err(|error| error.to_string())
+    }
+}
+
+/// The autoencoder of a latent diffusion preset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct AutoencoderSizes(pub stable_diffusion::Preset);
+
+impl Sizes for AutoencoderSizes {
+    type Config = VaeConfig;
+
+    fn config(self) -> VaeConfig {
+        self.0.vae()
+    }
+
+    fn checked(config: VaeConfig) -> Result<VaeConfig, String> {
+        config.checked().map_err(|error| error.to_string())
+    }
+}
+
+/// The UNet of a latent diffusion preset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct UNetSizes(pub stable_diffusion::Preset);
+
+impl Sizes for UNetSizes {
+    type Config = UNetConfig;
+
+    fn config(self) -> UNetConfig {
+        self.0.unet()
+    }
+
+    fn checked(config: UNetConfig) -> Result<UNetConfig, String> {
+        config.checked().map_err(|error| error.to_string())
+    }
+}
+
+impl<P: Sizes> From<P> for Choice<P> {
+    fn from(preset: P) -> Self {
         Self { preset, config: preset.config() }
     }
 }
 
-impl<'de> Deserialize<'de> for ModelChoice {
+impl<'de, P: Sizes> Deserialize<'de> for Choice<P> {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         use serde::de::Error;
         let mut table = Table::deserialize(deserializer)?;
         let preset = table.remove("preset").ok_or_else(|| D::Error::missing_field("preset"))?;
-        let preset: Preset = preset.try_into().map_err(D::Error::custom)?;
+        let preset: P = preset.try_into().map_err(D::Error::custom)?;
         let base = Value::try_from(preset.config()).map_err(D::Error::custom)?;
-        let config: BevVaeConfig = merge(base, Value::Table(table)).try_into().map_err(D::Error::custom)?;
-        Ok(Self { preset, config: config.checked().map_err(D::Error::custom)? })
+        let config: P::Config = merge(base, Value::Table(table)).try_into().map_err(D::Error::custom)?;
+        Ok(Self { preset, config: P::checked(config).map_err(D::Error::custom)? })
     }
 }
 
-impl Serialize for ModelChoice {
+impl<P: Sizes> Serialize for Choice<P> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         use serde::ser::Error;
         let mut table = Table::new();
@@ -45,6 +113,8 @@ impl Serialize for ModelChoice {
 
 #[cfg(test)]
 mod tests {
+    use vae::Preset;
+
     use super::*;
 
     #[test]
@@ -55,6 +125,19 @@ mod tests {
         assert_eq!(choice.config.image.decoder_blocks, Preset::Tiny.config().image.decoder_blocks);
         let again: ModelChoice = toml::from_str(&toml::to_string(&choice).unwrap()).unwrap();
         assert_eq!(choice, again);
+    }
+
+    #[test]
+    fn latent_diffusion_networks_are_chosen_alike() {
+        let text = "preset = \"tiny\"\n[encoder]\ncross_view = \"sum\"\n";
+        let choice: Choice<UNetSizes> = toml::from_str(text).unwrap();
+        assert!(choice.config.encoder.needs_views());
+        let again: Choice<UNetSizes> = toml::from_str(&toml::to_string(&choice).unwrap()).unwrap();
+        assert_eq!(choice, again);
+        let choice: Choice<AutoencoderSizes> = toml::from_str("preset = \"debug\"\nresnets_per_level = 2").unwrap();
+        assert_eq!(choice.config.resnets_per_level, 2);
+        let error = toml::from_str::<Choice<AutoencoderSizes>>("preset = \"debug\"\nnorm_groups = 3").unwrap_err();
+        assert!(error.to_string().contains("norm_groups 3 must divide"), "{error}");
     }
 
     #[test]

@@ -2,6 +2,8 @@
 
 use burn::tensor::{Bool, Device, Tensor, TensorData};
 use data::ViewArrays;
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
 use vae::ViewMatrices;
 
 /// Pictures `[B, V, 3, H, W]`, RGB in [0, 1].
@@ -46,4 +48,23 @@ pub fn displayed(network: Tensor<5>) -> Vec<Vec<f32>> {
     let rgb = vae::pixels::denormalise(network).clamp(0.0, 1.0);
     let values: Vec<f32> = rgb.into_data().iter::<f32>().collect();
     values.chunks_exact(c * h * w).map(<[f32]>::to_vec).collect()
+}
+
+/// RGB in [0, 1] to what latent diffusion networks see, [−1, 1]. Any shape.
+pub fn signed<const D: usize>(rgb: Tensor<D>) -> Tensor<D> {
+    rgb * 2.0 - 1.0
+}
+
+/// Pictures of latent diffusion networks, `[N, 3, H, W]` in about [−1, 1], back to RGB in [0, 1] on the host, clamped: one `[3, H, W]`
+/// per item.
+pub fn displayed_signed(network: Tensor<4>) -> Vec<Vec<f32>> {
+    let [_, c, h, w] = network.dims();
+    let values: Vec<f32> = stable_diffusion::vae::pixels_from_network(network).into_data().iter::<f32>().collect();
+    values.chunks_exact(c * h * w).map(<[f32]>::to_vec).collect()
+}
+
+/// Standard normal numbers drawn on the host, so that every backend sees the same.
+pub fn normal<const D: usize>(shape: [usize; D], rng: &mut impl Rng, device: &Device) -> Tensor<D> {
+    let values: Vec<f32> = (0..shape.iter().product()).map(|_| StandardNormal.sample(rng)).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
 }

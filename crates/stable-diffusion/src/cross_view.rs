@@ -5,12 +5,11 @@
 
 use burn::module::Module;
 use burn::tensor::{Bool, Device, Int, Tensor, TensorData};
-use nn::{Bias, Init, Linear};
+use nn::{Bias, Init, LayerNorm, Linear};
 use serde::{Deserialize, Serialize};
 
 use crate::attention::{Attention, attend};
 use crate::config::ConfigError;
-use crate::layers::LayerNorm;
 
 /// How what a view sees in its neighbours becomes one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -129,7 +128,7 @@ impl CrossView {
     /// Fresh weights; `heads` must divide `width`.
     pub fn new(width: usize, heads: usize, merge: NeighbourMerge, init: &mut Init) -> Self {
         Self {
-            norm4: LayerNorm::new(width, 1e-5, init),
+            norm4: LayerNorm::with_bias(width, 1e-5, init),
             attn4: Attention::new(width, width, heads, Bias::Without, init),
             connector: Linear::zeros(width, width, Bias::With, init),
             merge,

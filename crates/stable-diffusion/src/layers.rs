@@ -1,10 +1,11 @@
-//! Convolution, layer norm and the two ways to change size. Shapes: N items, C channels, H W pixels.
+//! Convolution and the two ways to change size. Shapes: N items, C channels, H W pixels.
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::module::{conv2d, interpolate};
-use burn::tensor::ops::{ConvOptions, InterpolateMode, InterpolateOptions, PadMode};
+use burn::tensor::module::interpolate;
+use burn::tensor::ops::{InterpolateMode, InterpolateOptions, PadMode};
 use nn::Init;
+use nn::lora::Adapters;
 
 /// Square convolution with a bias.
 #[derive(Module, Debug)]
@@ -13,6 +14,8 @@ pub struct Conv2d {
     pub weight: Param<Tensor<4>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    /// None unless [`nn::lora::attach`] puts them there.
+    pub lora: Adapters,
     stride: usize,
     padding: usize,
 }
@@ -34,43 +37,24 @@ impl Conv2d {
     ) -> Self {
         let bound = 1.0 / ((c_in * kernel * kernel) as f64).sqrt();
         let weight = init.uniform([c_out, c_in, kernel, kernel], bound);
-        Self { weight, bias: init.uniform([c_out], bound), stride, padding }
+        Self { weight, bias: init.uniform([c_out], bound), lora: Adapters::none(), stride, padding }
     }
 
     /// Size-keeping convolution that starts as 0: a branch that changes nothing before it is trained.
     pub fn zeros(c_in: usize, c_out: usize, kernel: usize, init: &mut Init) -> Self {
         let weight = init.constant([c_out, c_in, kernel, kernel], 0.0);
-        Self { weight, bias: init.constant([c_out], 0.0), stride: 1, padding: kernel / 2 }
+        Self { weight, bias: init.constant([c_out], 0.0), lora: Adapters::none(), stride: 1, padding: kernel / 2 }
     }
 
     /// # Shapes
     /// - x: `[N, in, H, W]`
     /// - output: `[N, out, H', W']`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let options = ConvOptions::new([self.stride; 2], [self.padding; 2], [1, 1], 1);
-        conv2d(x, self.weight.val(), Some(self.bias.val()), options)
-    }
-}
-
-/// Layer norm over the last axis with gain and bias.
-#[derive(Module, Debug)]
-pub struct LayerNorm {
-    /// `[D]`
-    pub weight: Param<Tensor<1>>,
-    /// `[D]`
-    pub bias: Param<Tensor<1>>,
-    epsilon: f32,
-}
-
-impl LayerNorm {
-    /// Gains 1, biases 0.
-    pub fn new(width: usize, epsilon: f32, init: &mut Init) -> Self {
-        Self { weight: init.constant([width], 1.0), bias: init.constant([width], 0.0), epsilon }
-    }
-
-    /// Shape unchanged.
-    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::layer_norm(x, Some(self.weight.val()), Some(self.bias.val()), self.epsilon)
+        let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
+        let [_, _, height, width] = self.weight.dims();
+        let kernel = self.lora.kernel(&self.weight);
+        let base = |x| ops::conv2d(x, kernel, Some(self.bias.val()), stride, padding);
+        self.lora.add_to_conv2d(x, ([height, width], stride, padding), base)
     }
 }
 

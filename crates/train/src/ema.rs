@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::checkpoint::{CheckpointReader, CheckpointWriter};
-use crate::params::{NamedTensors, inner_device, map_parameters, named_parameters};
+use crate::lanes::for_each_job;
+use crate::params::{NamedTensor, NamedTensors, inner_device, map_parameters, named_parameters};
 use crate::weights::WeightDiff;
 
 /// Settings of an [`Ema`].
@@ -50,11 +51,17 @@ impl Ema {
     /// Moves the average towards `module`, which must have the parameters it was made from.
     pub fn update<M: Module>(&mut self, module: &M) {
         let decay = self.decay();
-        for (path, new) in named_parameters(module) {
-            if let Some(old) = self.average.remove(&path) {
-                let values = old.values.mul_scalar(decay).add(new.values.mul_scalar(1.0 - decay));
-                self.average.insert(path, crate::params::NamedTensor { values, ..old });
-            }
+        if let Some(device) = inner_device(module) {
+            let pairs = named_parameters(module).into_iter();
+            let pairs = pairs.filter_map(|(path, new)| Some((self.average.remove(&path)?, path, new))).collect();
+            self.average.extend(for_each_job(
+                &device,
+                pairs,
+                |(old, path, new): (NamedTensor, String, NamedTensor)| {
+                    let values = old.values.mul_scalar(decay).add(new.values.mul_scalar(1.0 - decay));
+                    (path, NamedTensor { values, ..old })
+                },
+            ));
         }
         self.updates += 1;
     }

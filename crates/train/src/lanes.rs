@@ -1,6 +1,10 @@
 //! Micro batches side by side. Half of a step's operations are too small for all cores, so two small steps at once finish
 //! sooner than one after the other, and each result is the same as when computed alone.
 
+use burn::backend::DispatchDevice;
+use burn::tensor::Device;
+use rayon::prelude::*;
+
 /// Runs `work` on every item, at most `lanes` at a time, and returns the results in order.
 ///
 /// Work that differentiates must not share tracked parameters between items: give each its own
@@ -23,6 +27,16 @@ pub fn in_lanes<T: Sync, R: Send>(items: &[T], lanes: usize, work: impl Fn(usize
         results.extend(slots.into_iter().flatten());
     }
     results
+}
+
+/// Runs `work` on every job, side by side on the CPU backend and one after another elsewhere; the results keep the order of the jobs.
+pub(crate) fn for_each_job<T: Send, R: Send>(
+    device: &Device,
+    jobs: Vec<T>,
+    work: impl Fn(T) -> R + Sync + Send,
+) -> Vec<R> {
+    let on_cpu = matches!(device.clone().inner().as_dispatch(), DispatchDevice::Flex(_));
+    if on_cpu { jobs.into_par_iter().map(work).collect() } else { jobs.into_iter().map(work).collect() }
 }
 
 #[cfg(test)]

@@ -13,7 +13,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::checkpoint::{CheckpointReader, CheckpointWriter};
-use crate::params::{NamedTensor, NamedTensors, ParamInfo, inner_device, list_parameters, map_with_gradients};
+use crate::lanes::for_each_job;
+use crate::params::{
+    NamedTensor, NamedTensors, ParamInfo, inner_device, list_parameters, map_parameters, map_with_gradients,
+};
 use crate::schedule::Schedule;
 use crate::update::GradientClip;
 use crate::weights::WeightDiff;
@@ -37,6 +40,34 @@ pub struct OptimizerConfig {
     pub gradient_clip: GradientClip,
     /// Learning rate over the steps.
     pub schedule: Schedule,
+    /// Factors on the learning rate by the start of a parameter's path, such as `"encoder.scene" = 3.0`; the longest match wins, 1 without
+    /// any. Narrow layers bear larger steps than wide ones.
+    pub learning_rate_factors: BTreeMap<String, f64>,
+}
+
+impl OptimizerConfig {
+    /// # Errors
+    /// [`TrainError::Config`] for a factor that is no finite number from 0, or for a path that no parameter of `module` has.
+    pub fn check<M: Module>(&self, module: &M) -> Result<(), TrainError> {
+        let parameters = list_parameters(module);
+        for (prefix, &factor) in &self.learning_rate_factors {
+            let known = parameters.iter().any(|info| is_within(&info.path, prefix));
+            if !known {
+                let why = format!("learning_rate_factors: no parameter's path starts with {prefix:?}");
+                return Err(TrainError::Config(why));
+            }
+            if !factor.is_finite() || factor < 0.0 {
+                let why = format!("learning_rate_factors.{prefix:?} = {factor}: needs a finite number from 0");
+                return Err(TrainError::Config(why));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether `path` is `prefix` or lies below it: `a.b.c` is within `a.b`, `a.bc` is not.
+fn is_within(path: &str, prefix: &str) -> bool {
+    path.strip_prefix(prefix).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
 impl Default for OptimizerConfig {
@@ -49,6 +80,7 @@ impl Default for OptimizerConfig {
             decay_scope: DecayScope::default(),
             gradient_clip: GradientClip::default(),
             schedule: Schedule::default(),
+            learning_rate_factors: BTreeMap::new(),
         }
     }
 }
@@ -101,6 +133,7 @@ pub struct AdamW {
     eps: f64,
     weight_decay: f64,
     scope: DecayScope,
+    learning_rate_factors: BTreeMap<String, f64>,
     state: BTreeMap<String, Moments>,
 }
 
@@ -112,6 +145,7 @@ impl AdamW {
             eps: config.eps,
             weight_decay: config.weight_decay,
             scope: config.decay_scope.clone(),
+            learning_rate_factors: config.learning_rate_factors.clone(),
             state: BTreeMap::new(),
         }
     }
@@ -121,14 +155,43 @@ impl AdamW {
     /// counts the updates of that parameter from 1.
     #[must_use]
     pub fn step<M: Module>(&mut self, module: M, grads: &mut GradientsParams, learning_rate: f64) -> M {
-        map_with_gradients(module, grads, |info, values, grad| self.update(info, values, grad, learning_rate))
+        let mut jobs = Vec::new();
+        let module = map_with_gradients(module, grads, |info, values, grad| {
+            jobs.push((info.clone(), values.clone(), grad, self.state.remove(&info.path)));
+            values
+        });
+        let Some(device) = inner_device(&module) else { return module };
+        let this = &*self;
+        let updated = for_each_job(&device, jobs, |(info, values, grad, old)| {
+            let (values, moments) = this.update(&info, values, grad, old, learning_rate * this.factor(&info.path));
+            (info.path, values, moments)
+        });
+        let mut new_values = BTreeMap::new();
+        for (path, values, moments) in updated {
+            self.state.insert(path.clone(), moments);
+            new_values.insert(path, values);
+        }
+        map_parameters(module, |info, values| new_values.remove(&info.path).unwrap_or(values))
     }
 
-    fn update(&mut self, info: &ParamInfo, values: Tensor<1>, grad: Tensor<1>, learning_rate: f64) -> Tensor<1> {
+    /// Factor on the learning rate of the parameter at `path`.
+    fn factor(&self, path: &str) -> f64 {
+        let matching = self.learning_rate_factors.iter().filter(|(prefix, _)| is_within(path, prefix));
+        matching.max_by_key(|(prefix, _)| prefix.len()).map_or(1.0, |(_, &factor)| factor)
+    }
+
+    fn update(
+        &self,
+        info: &ParamInfo,
+        values: Tensor<1>,
+        grad: Tensor<1>,
+        old: Option<Moments>,
+        learning_rate: f64,
+    ) -> (Tensor<1>, Moments) {
         let [beta1, beta2] = self.betas;
         let fresh_first = grad.clone().mul_scalar(1.0 - beta1);
         let fresh_second = grad.clone().mul(grad).mul_scalar(1.0 - beta2);
-        let (first, second, updates) = match self.state.remove(&info.path) {
+        let (first, second, updates) = match old {
             Some(old) => {
                 let first = old.first.mul_scalar(beta1).add(fresh_first);
                 (first, old.second.mul_scalar(beta2).add(fresh_second), old.updates + 1)
@@ -140,8 +203,7 @@ impl AdamW {
         let change = first.clone().mul_scalar(learning_rate / correction(beta1)).div(root);
         let decay = learning_rate * self.weight_decay;
         let values = if decay != 0.0 && self.scope.covers(info) { values.mul_scalar(1.0 - decay) } else { values };
-        self.state.insert(info.path.clone(), Moments { shape: info.shape.clone(), first, second, updates });
-        values.sub(change)
+        (values.sub(change), Moments { shape: info.shape.clone(), first, second, updates })
     }
 
     /// Moments by name: `first.<path>` and `second.<path>`.

@@ -5,8 +5,6 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::activation::leaky_relu;
-use burn::tensor::module::conv2d;
-use burn::tensor::ops::ConvOptions;
 use burn::tensor::{Tensor, TensorData};
 use nn::Init;
 
@@ -40,8 +38,7 @@ impl EqualConv {
         let weight = self.weight.val();
         let [_, c_in, k, _] = weight.dims();
         let scale = 1.0 / ((c_in * k * k) as f64).sqrt();
-        let options = ConvOptions::new([self.stride; 2], [self.padding; 2], [1, 1], 1);
-        conv2d(x, weight * scale, self.bias.as_ref().map(Param::val), options)
+        ops::conv2d(x, weight * scale, self.bias.as_ref().map(Param::val), [self.stride; 2], [self.padding; 2])
     }
 }
 
@@ -62,7 +59,7 @@ impl EqualLinear {
     fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let weight = self.weight.val();
         let scale = 1.0 / (weight.dims()[1] as f64).sqrt();
-        x.matmul(weight.transpose() * scale) + self.bias.val().unsqueeze::<2>()
+        ops::linear(x, weight * scale, Some(self.bias.val()))
     }
 }
 
@@ -73,11 +70,13 @@ fn activate<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 
 /// The [1, 3, 3, 1] ⊗ [1, 3, 3, 1] / 64 filter on every channel.
 fn blur(x: Tensor<4>, padding: usize, stride: usize) -> Tensor<4> {
-    let c = x.dims()[1];
+    let [b, c, h, w] = x.dims();
     let line = [1.0_f32, 3.0, 3.0, 1.0];
     let kernel: Vec<f32> = line.iter().flat_map(|a| line.map(|b| a * b / 64.0)).collect();
-    let kernel = Tensor::<4>::from_data(TensorData::new(kernel, [1, 1, 4, 4]), &x.device()).repeat_dim(0, c);
-    conv2d(x, kernel, None, ConvOptions::new([stride; 2], [padding; 2], [1, 1], c))
+    let kernel = Tensor::<4>::from_data(TensorData::new(kernel, [1, 1, 4, 4]), &x.device());
+    let y = ops::conv2d(x.reshape([b * c, 1, h, w]), kernel, None, [stride; 2], [padding; 2]);
+    let [_, _, h, w] = y.dims();
+    y.reshape([b, c, h, w])
 }
 
 /// One halving of resolution.

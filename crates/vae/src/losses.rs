@@ -22,11 +22,11 @@ pub fn masked_l2(
     let [b, v, c, h, w] = decoded.dims();
     let squares = (decoded - target).square();
     let per_view = match counted {
-        None => squares.reshape([b, v, c * h * w]).mean_dim(2),
+        None => ops::mean_dim(squares.reshape([b, v, c * h * w]), 2),
         Some(counted) => {
-            let sum = (squares * counted.clone()).reshape([b, v, c * h * w]).sum_dim(2);
+            let sum = ops::sum_dim((squares * counted.clone()).reshape([b, v, c * h * w]), 2);
             // A view without any counted pixel has the error 0.
-            sum / counted.reshape([b, v, h * w]).sum_dim(2).mul_scalar(c as f64).clamp_min(1.0)
+            sum / ops::sum_dim(counted.reshape([b, v, h * w]), 2).mul_scalar(c as f64).clamp_min(1.0)
         }
     };
     let weights = mask.float();

@@ -61,7 +61,7 @@ impl RayAttention {
         let [_, s, _] = values.dims();
         let (m, p) = (self.heads, self.points);
         let offsets = self.offset.forward(query.clone()).reshape([b, v * n, m, LEVELS, p, 3]);
-        let weights = softmax(self.weight.forward(query.clone()).reshape([b, v, n, m, LEVELS * p]), 4);
+        let weights = ops::softmax(self.weight.forward(query.clone()).reshape([b, v, n, m, LEVELS * p]));
         let gathered = ops::deformable_rays_3d(
             values.reshape([b, s, m, c / m]),
             levels,
@@ -74,7 +74,7 @@ impl RayAttention {
         let logits = self.depth.forward(query).reshape([b * v, depths, rays_per_view]);
         let share = depth_weights(logits, rays.valid.clone().reshape([b * v, depths, rays_per_view]));
         let gathered = gathered.reshape([b * v, depths, rays_per_view, c]);
-        let summed = (gathered * share.unsqueeze_dim::<4>(3)).sum_dim(1);
+        let summed = ops::sum_dim(gathered * share.unsqueeze_dim::<4>(3), 1);
         self.out.forward(summed.reshape([b, v, rays_per_view, c]))
     }
 }
@@ -205,7 +205,7 @@ impl SceneDecoder {
     pub fn collapse(&self, points: Tensor<4>, depths: usize) -> Tensor<3> {
         let [b, v, n, c] = points.dims();
         let rays = n / depths;
-        let mean = points.reshape([b * v, depths, rays, c]).mean_dim(1).reshape([b * v, rays, c]);
+        let mean = ops::mean_dim(points.reshape([b * v, depths, rays, c]), 1).reshape([b * v, rays, c]);
         self.norm.forward(mean)
     }
 }

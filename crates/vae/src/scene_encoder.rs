@@ -4,7 +4,6 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::activation::softmax;
 use nn::{Bias, Init, LayerNorm, Linear, Mlp, NORM_EPSILON, sincos_3d};
 
 use crate::BevVaeConfig;
@@ -53,7 +52,7 @@ impl ViewAttention {
         let [_, v, s, _] = values.dims();
         let (m, p) = (self.heads, self.points);
         let offsets = self.offset.forward(query.clone()).reshape([b, q, m, LEVELS, p, 2]);
-        let weights = softmax(self.weight.forward(query).reshape([b, q, m, LEVELS * p]), 3);
+        let weights = ops::softmax(self.weight.forward(query).reshape([b, q, m, LEVELS * p]));
         let gathered = ops::deformable_views_2d(
             values.reshape([b, v, s, m, c / m]),
             levels,

@@ -125,7 +125,7 @@ impl DiagonalGaussian {
     pub fn kl(&self) -> Tensor<1> {
         let [b, n, l] = self.mean.dims();
         let terms = self.mean.clone().square() + self.log_var.clone().exp() - 1.0 - self.log_var.clone();
-        terms.reshape([b, n * l]).sum_dim(1).reshape([b]) * 0.5
+        ops::sum_dim(terms.reshape([b, n * l]), 1).reshape([b]) * 0.5
     }
 }
 

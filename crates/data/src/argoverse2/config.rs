@@ -1,12 +1,12 @@
 //! What to read: folder, split, logs, cameras, frames, boxes.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use crate::DataError;
-use crate::store::checked_name;
+use crate::store::{Roots, checked_name};
 use crate::taxonomy::ClassRule;
 
 /// The ring, clockwise from the front; the rig of a log unless `cameras` says otherwise.
@@ -26,8 +26,9 @@ pub(crate) const STEREO: [&str; 2] = ["stereo_front_left", "stereo_front_right"]
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Argoverse2Config {
-    /// Folder that holds `train`, `val` and `test`, perhaps below `sensor`; or a folder of logs without splits.
-    pub root: PathBuf,
+    /// Folder or archive that holds `train`, `val` and `test`, perhaps below `sensor`; or a folder of logs without splits; or a list of
+    /// these.
+    pub root: Roots,
     /// Which split's folder.
     #[serde(default)]
     pub split: Split,
@@ -75,7 +76,7 @@ pub struct Argoverse2Config {
 
 impl Argoverse2Config {
     /// The defaults for a dataset folder: every log, the ring cameras, annotated frames.
-    pub fn new(root: impl Into<PathBuf>) -> Self {
+    pub fn new(root: impl Into<Roots>) -> Self {
         Self {
             root: root.into(),
             split: Split::default(),

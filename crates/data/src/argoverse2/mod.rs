@@ -69,7 +69,7 @@ impl Argoverse2 {
     /// [`DataError::Calibration`], a split without a log [`DataError::Empty`].
     pub fn open(config: &Argoverse2Config) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let places = log::find(&store, config)?;
         let logs: Vec<Log> =
             places.into_par_iter().map(|place| Log::open(&store, place, config)).collect::<Result<_, _>>()?;

@@ -5,7 +5,7 @@ use geometry::{Camera, CameraRig, Intrinsics, Lens, RigCamera, Rigid};
 use super::database::{Database, Row};
 use super::token::Token;
 use crate::DataError;
-use crate::pickle::{Rules, Value, decode};
+use pickle::{Rules, Value, decode};
 
 /// The classes that calibration is pickled with; all are lists.
 const LIST_CLASSES: [(&str, &str); 4] = [

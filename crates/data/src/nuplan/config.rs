@@ -1,25 +1,28 @@
 //! What to read: folders, split, cameras, windows.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use crate::DataError;
+use crate::store::Roots;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the nuPlan reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NuPlanConfig {
-    /// Folder or archive that holds the databases and the pictures.
-    pub root: PathBuf,
+    /// Folder or archive that holds the databases and the pictures; or a list of both: the release comes in pieces.
+    pub root: Roots,
     /// Folder of the databases below `root`; they lie in it or in its direct subfolders (`mini`, `trainval`, `test`).
     #[serde(default = "default_databases")]
     pub databases: String,
     /// Folder of the pictures below `root`.
     #[serde(default = "default_sensor_blobs")]
     pub sensor_blobs: String,
+    /// Folder of the city maps below `root`; without it the dataset has no maps.
+    #[serde(default = "default_maps")]
+    pub maps: String,
     /// An official list of logs (`train`, `val`, `test`), `mini` for the logs of the subfolder of that name, or `all`.
     #[serde(default = "default_split")]
     pub split: String,
@@ -57,11 +60,12 @@ pub struct NuPlanConfig {
 
 impl NuPlanConfig {
     /// The defaults for a dataset folder: every log with pictures, every camera.
-    pub fn new(root: impl Into<PathBuf>) -> Self {
+    pub fn new(root: impl Into<Roots>) -> Self {
         Self {
             root: root.into(),
             databases: default_databases(),
             sensor_blobs: default_sensor_blobs(),
+            maps: default_maps(),
             split: default_split(),
             logs: Vec::new(),
             cameras: Vec::new(),
@@ -104,6 +108,10 @@ fn default_databases() -> String {
 
 fn default_sensor_blobs() -> String {
     "nuplan-v1.1/sensor_blobs".to_owned()
+}
+
+fn default_maps() -> String {
+    "maps".to_owned()
 }
 
 fn default_split() -> String {

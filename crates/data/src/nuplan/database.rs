@@ -112,6 +112,15 @@ impl Database {
         Ok(())
     }
 
+    /// Whether a plain table has a stored column of this name.
+    pub fn has_column(&self, table: &str, column: &str) -> Result<bool, DataError> {
+        match self.check_columns(table, &[column]) {
+            Ok(()) => Ok(true),
+            Err(DataError::Column { .. }) => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
     /// Reads a table in the order of the file. The first column must be the row's token.
     ///
     /// # Errors
@@ -179,6 +188,7 @@ impl Row<'_> {
     /// A value of another type than the column's.
     pub fn wrong(&self, at: usize, why: &str) -> DataError {
         let row = match self.row.get_ref(0) {
+            Ok(ValueRef::Integer(key)) => key.to_string(),
             Ok(ValueRef::Blob(token)) => token.iter().map(|byte| format!("{byte:02x}")).collect(),
             _ => "without a token".to_owned(),
         };
@@ -258,6 +268,22 @@ impl Row<'_> {
                 std::str::from_utf8(bytes).map_err(|_| self.wrong(at, "holds text that is not UTF-8"))
             }
             _ => Err(self.wrong(at, "holds no text")),
+        }
+    }
+
+    /// Text that may be absent.
+    pub fn maybe_text(&self, at: usize) -> Result<Option<&str>, DataError> {
+        match self.value(at)? {
+            ValueRef::Null => Ok(None),
+            _ => self.text(at).map(Some),
+        }
+    }
+
+    /// Bytes that may be absent.
+    pub fn maybe_blob(&self, at: usize) -> Result<Option<&[u8]>, DataError> {
+        match self.value(at)? {
+            ValueRef::Null => Ok(None),
+            _ => self.blob(at).map(Some),
         }
     }
 

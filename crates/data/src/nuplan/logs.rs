@@ -9,6 +9,7 @@ use super::boxes::{self, Classes};
 use super::cameras::read_cameras;
 use super::config::{NuPlanConfig, ns, split_logs};
 use super::database::Database;
+use super::maps;
 use super::sets::{ImageRow, PictureSet, SetMaker};
 use super::token::Token;
 use crate::DataError;
@@ -72,6 +73,10 @@ pub(super) struct Log {
     pub name: String,
     pub file: StoredFile,
     pub location: Option<String>,
+    /// Names under which its city's map may lie.
+    pub map_names: Vec<String>,
+    /// The map, where it is there.
+    pub map: Option<StoredFile>,
     /// Wanted cameras, clockwise from the front.
     pub cameras: Vec<RigCamera>,
     /// `None`: not annotated.
@@ -103,10 +108,13 @@ pub(super) fn read_log(config: &NuPlanConfig, store: &Store, log: &LogFile) -> R
         boxes::check_boxes(&database)?;
     }
     let tags = read_tags(&database)?;
+    let (location, map_names) = read_location(&database)?;
     let mut read = Log {
         name: log.name.clone(),
         file: log.file.clone(),
-        location: read_location(&database)?,
+        location,
+        map: maps::find(store, &config.maps, &map_names)?,
+        map_names,
         cameras,
         classes,
         has_tags: !tags.is_empty(),
@@ -162,12 +170,20 @@ fn read_images(
     Ok(rows)
 }
 
-fn read_location(database: &Database) -> Result<Option<String>, DataError> {
+/// The city, and the names of its map: releases have put it into either column.
+fn read_location(database: &Database) -> Result<(Option<String>, Vec<String>), DataError> {
     if !database.has_table("log")? {
-        return Ok(None);
+        return Ok((None, Vec::new()));
     }
     let rows = database.read("log", &["token", "location"], |row| Ok(row.text(1)?.to_owned()))?;
-    Ok(rows.into_iter().next())
+    let location = rows.into_iter().next();
+    let mut names = Vec::new();
+    if database.has_column("log", "map_version")? {
+        names = database.read("log", &["token", "map_version"], |row| Ok(row.maybe_text(1)?.map(str::to_owned)))?;
+    }
+    let mut names: Vec<String> = names.into_iter().take(1).flatten().chain(location.clone()).collect();
+    names.dedup();
+    Ok((location, names))
 }
 
 /// Scenario tags of each lidar turn, sorted and joined.

@@ -3,7 +3,7 @@
 //! A log is a scene. Cameras are ordered clockwise from the front by their calibration, every picture has the car's pose interpolated to its
 //! own stamp, and the reference instant of a frame is the lidar turn closest to its pictures, so that boxes need no interpolation. Most logs of
 //! the release have no pictures; they give no frames and [`check`] names them. Format: <https://www.nuscenes.org/nuplan>, as checked on databases
-//! with the shipped layout. Maps are not read.
+//! with the shipped layout. The vector maps (GeoPackage) are flat: they lie on the plane of the car's own axes.
 
 mod boxes;
 mod cameras;
@@ -11,10 +11,14 @@ mod check;
 mod config;
 mod database;
 mod logs;
+mod maps;
 mod pairing;
 mod sets;
 mod token;
+mod utm;
+pub mod wkb;
 
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -31,11 +35,12 @@ pub(crate) use token::Token;
 
 use database::Database;
 use logs::Log;
+use maps::CityMap;
 use sets::{PictureSet, SetView};
 
 use crate::procedural_cache::SceneCache;
 use crate::store::Store;
-use crate::{Capabilities, DataError, FrameId, ImageSource, ObjectBox, SceneDataset, SceneFrame, View};
+use crate::{Capabilities, DataError, FrameId, ImageSource, LocalMap, ObjectBox, SceneDataset, SceneFrame, View};
 
 /// Databases kept open. One costs a few dozen kilobytes on a disk and its own size in an archive.
 const OPEN_DATABASES: usize = 8;
@@ -49,6 +54,8 @@ pub struct NuPlan {
     ranges: Vec<Range<usize>>,
     logs_without_pictures: Vec<String>,
     databases: SceneCache<Mutex<Option<Database>>>,
+    /// Cities that were asked for.
+    maps: Mutex<HashMap<String, Arc<CityMap>>>,
 }
 
 /// A log of an opened dataset.
@@ -71,7 +78,7 @@ impl NuPlan {
     /// Every broken database, with its file and the row: see [`DataError`]. [`DataError::Empty`] for a split without a log that has pictures.
     pub fn open(config: &NuPlanConfig) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let files = logs::find_logs(config, &store)?;
         let read: Vec<Option<Log>> =
             files.par_iter().map(|file| logs::read_log(config, &store, file)).collect::<Result<_, _>>()?;
@@ -90,7 +97,8 @@ impl NuPlan {
         };
         let ranges = logs.iter().map(range).collect();
         let databases = SceneCache::new(OPEN_DATABASES);
-        Ok(Self { config: config.clone(), store, logs, ranges, logs_without_pictures, databases })
+        let maps = Mutex::default();
+        Ok(Self { config: config.clone(), store, logs, ranges, logs_without_pictures, databases, maps })
     }
 
     /// The logs in frame order.
@@ -128,6 +136,27 @@ impl NuPlan {
         }
         let Some(database) = database.as_ref() else { return Ok(None) };
         boxes::read_boxes(database, lidar, &set.world_from_ego.inverse(), classes).map(Some)
+    }
+
+    /// The map of a log's city. Threads that ask at the same time wait for the one that reads.
+    fn city_map(&self, log: &Log) -> Result<Arc<CityMap>, DataError> {
+        let file = match &log.map {
+            Some(file) => file,
+            None if self.logs.iter().any(|log| log.map.is_some()) => {
+                let what = format!("map of {}", log.map_names.join(" or "));
+                return Err(DataError::Missing { what, path: self.store.path(&self.config.maps) });
+            }
+            None => return Err(self.unsupported("map")),
+        };
+        let key = file.path().to_string_lossy().into_owned();
+        // A panic elsewhere leaves the list whole: maps are inserted when they are complete.
+        let mut maps = self.maps.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(map) = maps.get(&key) {
+            return Ok(map.clone());
+        }
+        let map = Arc::new(CityMap::read(file)?);
+        maps.insert(key, map.clone());
+        Ok(map)
     }
 
     fn view(&self, log: &Log, camera: &geometry::RigCamera, view: &SetView) -> View {
@@ -176,6 +205,11 @@ impl SceneDataset for NuPlan {
         self.ranges.clone()
     }
 
+    fn local_map(&self, index: usize, half_m: f64) -> Result<LocalMap, DataError> {
+        let (_, log, set) = self.find(index)?;
+        self.city_map(log)?.around(&set.world_from_ego, half_m)
+    }
+
     fn name(&self) -> &str {
         &self.config.name
     }
@@ -197,6 +231,7 @@ impl SceneDataset for NuPlan {
     fn capabilities(&self) -> Capabilities {
         Capabilities {
             boxes: self.logs.iter().any(|log| log.classes.is_some()),
+            map: self.logs.iter().any(|log| log.map.is_some()),
             text: self.logs.iter().any(|log| log.has_tags),
             ..Capabilities::default()
         }

@@ -14,7 +14,7 @@ use super::poses::Poses;
 use super::schema::{CATEGORIES, TABLES, ddl};
 use crate::DataError;
 use crate::nuplan::{Token, sqlite};
-use crate::pickle::{encode_floats, encode_rows};
+use pickle::{encode_floats, encode_rows};
 
 /// A row's values in the order of its table's columns.
 macro_rules! row {

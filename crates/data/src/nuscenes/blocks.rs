@@ -2,11 +2,25 @@
 
 use std::io::Read;
 
+use memchr::memchr2;
+
 use crate::DataError;
 use crate::store::StoredFile;
 
-/// Bytes after which a block is closed at the next border between rows.
+/// Bytes read at once. A block ends at the last border between rows among them.
 pub(super) const BLOCK: usize = 1 << 20;
+
+/// What means something outside of strings.
+const IS_SIGN: [bool; 256] = {
+    let mut is_sign = [false; 256];
+    let signs = b"\"{}[],";
+    let mut at = 0;
+    while at < signs.len() {
+        is_sign[signs[at] as usize] = true;
+        at += 1;
+    }
+    is_sign
+};
 
 /// Some rows, rewritten as a JSON array of their own.
 pub(super) struct Block {
@@ -80,16 +94,8 @@ impl Blocks {
                 bytes[0] = b'[';
                 return Ok(Block { bytes, offset: self.offset, whole_table });
             }
-            if let Some(cut) = self.cut.filter(|cut| *cut >= self.block) {
-                let rest = self.buffer.split_off(cut);
-                let mut bytes = std::mem::replace(&mut self.buffer, rest);
-                bytes[0] = b'[';
-                bytes.push(b']');
-                let block = Block { bytes, offset: self.offset, whole_table: false };
-                self.offset += cut as u64;
-                self.scanned -= cut;
-                self.cut = None;
-                return Ok(block);
+            if let Some(cut) = self.cut.take() {
+                return Ok(self.split(cut));
             }
             if self.refill()? == 0 {
                 let at = self.offset + self.buffer.len() as u64;
@@ -97,6 +103,21 @@ impl Blocks {
             }
             self.start()?;
         }
+    }
+
+    /// Hands out what stands before a comma between rows.
+    fn split(&mut self, cut: usize) -> Block {
+        // Room for what is read next, so that nothing is moved again.
+        let mut rest = Vec::with_capacity(self.buffer.len() - cut + self.block);
+        rest.extend_from_slice(&self.buffer[cut..]);
+        let mut bytes = std::mem::replace(&mut self.buffer, rest);
+        bytes.truncate(cut);
+        bytes[0] = b'[';
+        bytes.push(b']');
+        let block = Block { bytes, offset: self.offset, whole_table: false };
+        self.offset += cut as u64;
+        self.scanned -= cut;
+        block
     }
 
     fn refill(&mut self) -> Result<usize, DataError> {
@@ -129,34 +150,33 @@ impl Blocks {
         if !self.started {
             return None;
         }
-        while let Some(byte) = self.buffer.get(self.scanned) {
-            let at = self.scanned;
-            self.scanned += 1;
-            if self.in_string {
-                match byte {
-                    _ if self.escaped => self.escaped = false,
-                    b'\\' => self.escaped = true,
-                    b'"' => self.in_string = false,
-                    _ => {}
-                }
+        let mut at = self.scanned;
+        self.scanned = self.buffer.len();
+        while let Some(rest) = self.buffer.get(at..).filter(|rest| !rest.is_empty()) {
+            if self.escaped {
+                self.escaped = false;
+                at += 1;
                 continue;
             }
-            match byte {
-                b'"' => self.in_string = true,
+            let step = match self.in_string {
+                true => memchr2(b'"', b'\\', rest),
+                false => rest.iter().position(|byte| IS_SIGN[usize::from(*byte)]),
+            };
+            let step = step?;
+            at += step + 1;
+            match rest[step] {
+                b'"' => self.in_string = !self.in_string,
+                b'\\' => self.escaped = true,
                 b'{' | b'[' => self.depth += 1,
-                b'}' | b']' => {
+                b',' if self.depth == 1 => self.cut = Some(at - 1),
+                b',' => {}
+                _ => {
                     self.depth = self.depth.saturating_sub(1);
                     if self.depth == 0 {
-                        return Some(self.scanned);
+                        self.scanned = at;
+                        return Some(at);
                     }
                 }
-                b',' if self.depth == 1 => {
-                    self.cut = Some(at);
-                    if at >= self.block {
-                        return None;
-                    }
-                }
-                _ => {}
             }
         }
         None

@@ -9,6 +9,7 @@ mod boxes;
 mod can_bus;
 mod config;
 mod expansions;
+mod export;
 mod json;
 pub mod map;
 mod occupancy;
@@ -27,6 +28,7 @@ pub use crate::taxonomy::ClassRule;
 pub use boxes::WorldBox;
 pub use can_bus::{CanBus, CanMessage, CanSignal, CanState};
 pub use config::{BoxMode, FrameChoice, NuScenesConfig, PictureTime};
+pub use export::{NewPictures, NuScenesExportConfig, NuScenesExportManifest, export_nuscenes};
 
 use annotations::Annotations;
 use expansions::Expansions;

@@ -30,10 +30,10 @@ enum Labels {
 impl Attached {
     pub(super) fn open(config: &OccupancyConfig) -> Result<Self, DataError> {
         let labels = match config.kind {
-            OccupancyKind::Occ3d => Labels::Occ3d(Occ3d::open(&config.root, config.masks)?),
-            OccupancyKind::OpenOccupancy => Labels::OpenOccupancy(Store::open(&config.root)?),
+            OccupancyKind::Occ3d => Labels::Occ3d(Occ3d::open(config.root.clone(), config.masks)?),
+            OccupancyKind::OpenOccupancy => Labels::OpenOccupancy(Store::open_all(&config.root)?),
             OccupancyKind::SurroundOcc => {
-                let store = Store::open(&config.root)?;
+                let store = Store::open_all(&config.root)?;
                 let folder = if store.list("samples")?.is_empty() { "" } else { "samples/" };
                 Labels::SurroundOcc(store, folder)
             }

@@ -13,8 +13,6 @@ mod occ3d_waymo;
 mod rows;
 mod write;
 
-use std::path::PathBuf;
-
 use serde::{Deserialize, Serialize};
 
 pub use grid::OCC3D_GRID;
@@ -23,14 +21,16 @@ pub use occ3d_waymo::{Occ3dWaymo, WaymoVoxels, read_occ3d_waymo};
 pub use rows::{OPEN_OCCUPANCY_GRID, SURROUND_OCC_GRID, read_open_occupancy, read_surround_occ};
 pub use write::{occ3d_bytes, write_occ3d};
 
+use crate::store::Roots;
+
 /// Labels that are attached to a nuScenes-layout dataset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OccupancyConfig {
     /// Which set.
     pub kind: OccupancyKind,
-    /// Its folder: the one with `gts` (Occ3D), with the `scene_...` folders (OpenOccupancy), with `samples` (SurroundOcc).
-    pub root: PathBuf,
+    /// Its folder or archive, or a list of both: the one with `gts` (Occ3D), with the `scene_...` folders (OpenOccupancy), with `samples` (SurroundOcc).
+    pub root: Roots,
     /// Read the lidar and camera masks too, which must be there then. Only Occ3D has them.
     #[serde(default = "yes")]
     pub masks: bool,
@@ -41,7 +41,7 @@ pub struct OccupancyConfig {
 
 impl OccupancyConfig {
     /// A set with its masks, at key frames.
-    pub fn new(kind: OccupancyKind, root: impl Into<PathBuf>) -> Self {
+    pub fn new(kind: OccupancyKind, root: impl Into<Roots>) -> Self {
         Self { kind, root: root.into(), masks: true, between: BetweenKeyFrames::default() }
     }
 }

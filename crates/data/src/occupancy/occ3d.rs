@@ -2,13 +2,11 @@
 //!
 //! <https://tsinghua-mars-lab.github.io/Occ3D/>
 
-use std::path::Path;
-
 use geometry::Rigid;
 
 use super::grid::{OCC3D_GRID, from_xyz};
 use crate::npz::{Dtype, Npz, Want};
-use crate::store::{Store, StoredFile, checked_name};
+use crate::store::{Roots, Store, StoredFile, checked_name};
 use crate::{DataError, OccupancyGrid, OccupancyLabels};
 
 /// Axes of the dense arrays.
@@ -27,8 +25,8 @@ impl Occ3d {
     ///
     /// # Errors
     /// [`DataError::Missing`] without the folder.
-    pub fn open(root: &Path, masks: bool) -> Result<Self, DataError> {
-        let store = Store::open(root)?;
+    pub fn open(root: impl Into<Roots>, masks: bool) -> Result<Self, DataError> {
+        let store = Store::open_all(&root.into())?;
         let prefix = if store.list("gts")?.is_empty() { "" } else { "gts/" };
         Ok(Self { store, prefix, masks })
     }

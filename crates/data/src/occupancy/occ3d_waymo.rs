@@ -2,15 +2,13 @@
 //!
 //! <https://tsinghua-mars-lab.github.io/Occ3D/>
 
-use std::path::Path;
-
 use geometry::{BevGrid, Rigid};
 use serde::{Deserialize, Serialize};
 
 use super::grid::{OCC3D_GRID, from_xyz};
 use super::occ3d::{bytes, check_labels, truths};
 use crate::npz::Npz;
-use crate::store::{Store, StoredFile};
+use crate::store::{Roots, Store, StoredFile};
 use crate::{DataError, OccupancyGrid, OccupancyLabels};
 
 /// Which of the two label files of a frame.
@@ -51,8 +49,8 @@ impl Occ3dWaymo {
     ///
     /// # Errors
     /// [`DataError::Missing`] without the folder.
-    pub fn open(root: &Path, voxels: WaymoVoxels) -> Result<Self, DataError> {
-        Ok(Self { store: Store::open(root)?, voxels })
+    pub fn open(root: impl Into<Roots>, voxels: WaymoVoxels) -> Result<Self, DataError> {
+        Ok(Self { store: Store::open_all(&root.into())?, voxels })
     }
 
     /// Labels of a frame, both numbered from 0 as the files are.

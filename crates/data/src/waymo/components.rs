@@ -39,12 +39,16 @@ pub(super) struct Segments {
 #[derive(Debug)]
 pub(super) struct Segment {
     pub name: String,
+    /// Its place among all segments of the split.
+    pub number: usize,
     /// The wanted cameras in rig order.
     pub cameras: Vec<RigCamera>,
     /// Numbers of all calibrated cameras.
     calibrated: Vec<i64>,
     /// Wanted frames in order of time.
     frames: Vec<(i64, Rigid)>,
+    /// Their places among all frames of the segment.
+    pub frame_numbers: Vec<usize>,
     images: StoredFile,
     boxes: Option<StoredFile>,
     stats: Option<StoredFile>,
@@ -69,10 +73,10 @@ pub(super) fn open(config: &WaymoConfig, store: &Store) -> Result<Segments, Data
             names.extend(entry.name.strip_suffix(".parquet").filter(|_| !entry.is_folder).map(ToOwned::to_owned));
         }
     }
-    let names = names.into_iter().map(|name| (name, ())).collect();
+    let names = names.into_iter().enumerate().map(|(number, name)| (name, number)).collect();
     let list = select(names, &config.scenes, &store.path(&config.inside("")))?
         .into_par_iter()
-        .map(|(name, ())| Segment::open(config, store, name))
+        .map(|(name, number)| Segment::open(config, store, name, number))
         .collect::<Result<_, _>>()?;
     Ok(Segments { list, tables: Recent::default() })
 }
@@ -107,17 +111,20 @@ impl Segments {
 }
 
 impl Segment {
-    fn open(config: &WaymoConfig, store: &Store, name: String) -> Result<Self, DataError> {
+    fn open(config: &WaymoConfig, store: &Store, name: String, number: usize) -> Result<Self, DataError> {
         let path = |component: &str| config.inside(&format!("{component}/{name}.parquet"));
         let [poses, calibration, images] = NEEDED.map(|component| store.file(&path(component), component));
         let (calibration, images) = (calibration?, images?);
-        let frames = rows::read_poses(config, &name, poses?)?;
+        let mut frames = rows::read_poses(&name, poses?)?;
+        let mut frame_numbers: Vec<usize> = (0..frames.len()).collect();
+        frame_numbers.retain(|at| frames.get(*at).is_some_and(|frame| !config.excludes(frame.0)));
+        frames.retain(|frame| !config.excludes(frame.0));
         let all = rows::read_calibration(&name, calibration.clone())?;
         let calibrated = all.iter().filter_map(|camera| cameras::number(&camera.channel)).collect();
         let wanted = all.into_iter().filter(|camera| config.wants(&camera.channel)).collect();
         let cameras = cameras::in_rig_order(wanted, calibration.path())?;
         let (boxes, stats) = (store.find(&path("lidar_box")), store.find(&path("stats")));
-        Ok(Self { name, cameras, calibrated, frames, images, boxes, stats })
+        Ok(Self { name, number, cameras, calibrated, frames, frame_numbers, images, boxes, stats })
     }
 
     pub fn len(&self) -> usize {

@@ -1,20 +1,21 @@
 //! What to read: folder, release, split, cameras.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use super::cameras;
 use crate::DataError;
+use crate::occupancy::WaymoVoxels;
+use crate::store::Roots;
 use crate::taxonomy::ClassRule;
 
 /// Settings of the Waymo reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WaymoConfig {
-    /// Folder that holds the splits.
-    pub root: PathBuf,
+    /// Folder or archive that holds the splits; or a list of both.
+    pub root: Roots,
     /// How the files are stored.
     pub release: WaymoRelease,
     /// Folder of the split below `root`: `training`, `validation`, `testing`, ...; `"."` where `root` is the split itself.
@@ -33,9 +34,26 @@ pub struct WaymoConfig {
     /// Frames that are known to be corrupt, by native time stamp in microseconds.
     #[serde(default)]
     pub exclude: Vec<String>,
+    /// Occupancy labels of Occ3D-Waymo.
+    #[serde(default)]
+    pub occupancy: Option<WaymoOccupancy>,
     /// Name the frames carry.
     #[serde(default = "default_name")]
     pub name: String,
+}
+
+/// Labels of Occ3D-Waymo for a split. They are numbered: segments in the order of their names in the whole split, frames in time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WaymoOccupancy {
+    /// Folder or archive that holds the numbered folders of the split, or a list of both.
+    pub root: Roots,
+    /// Which of the two grids.
+    #[serde(default)]
+    pub voxels: WaymoVoxels,
+    /// Numbers of segments by context name, for a copy that lacks a part of the split's segments.
+    #[serde(default)]
+    pub scenes: BTreeMap<String, usize>,
 }
 
 /// The two forms in which the perception set is published.
@@ -50,7 +68,7 @@ pub enum WaymoRelease {
 
 impl WaymoConfig {
     /// The defaults for a folder and release: every segment of the training split, every camera.
-    pub fn new(root: impl Into<PathBuf>, release: WaymoRelease) -> Self {
+    pub fn new(root: impl Into<Roots>, release: WaymoRelease) -> Self {
         Self {
             root: root.into(),
             release,
@@ -59,6 +77,7 @@ impl WaymoConfig {
             cameras: Vec::new(),
             classes: BTreeMap::new(),
             exclude: Vec::new(),
+            occupancy: None,
             name: default_name(),
         }
     }

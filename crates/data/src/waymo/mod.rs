@@ -19,10 +19,11 @@ mod records;
 use std::ops::Range;
 use std::path::Path;
 
-pub use config::{WaymoConfig, WaymoRelease};
+pub use config::{WaymoConfig, WaymoOccupancy, WaymoRelease};
 
+use crate::occupancy::Occ3dWaymo;
 use crate::store::Store;
-use crate::{Capabilities, DataError, LocalMap, SceneDataset, SceneFrame};
+use crate::{Capabilities, DataError, LocalMap, OccupancyGrid, SceneDataset, SceneFrame};
 use map::WorldMap;
 use raw::RawFrame;
 use recent::Recent;
@@ -36,6 +37,7 @@ pub struct Waymo {
     owners: Vec<usize>,
     ranges: Vec<Range<usize>>,
     max_views: usize,
+    occupancy: Option<Occ3dWaymo>,
 }
 
 #[derive(Debug)]
@@ -64,7 +66,7 @@ impl Waymo {
     /// Whatever is wrong with what was read, naming the file; [`DataError::Empty`] for a split without a frame.
     pub fn open(config: &WaymoConfig) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let segments = match config.release {
             WaymoRelease::V1 => Segments::V1 { list: records::open(config, &store)?, maps: Recent::default() },
             WaymoRelease::V2 => Segments::V2(components::open(config, &store)?),
@@ -81,7 +83,8 @@ impl Waymo {
             let what = if ranges.is_empty() { "the split" } else { "the choice of cameras" };
             return Err(DataError::Empty { what: what.to_owned(), path: store.path(&config.inside("")) });
         }
-        Ok(Self { config: config.clone(), segments, owners, ranges, max_views })
+        let labels = config.occupancy.as_ref().map(|set| Occ3dWaymo::open(set.root.clone(), set.voxels));
+        Ok(Self { config: config.clone(), segments, owners, ranges, max_views, occupancy: labels.transpose()? })
     }
 
     /// Where the publisher sees the labels of a frame, if its files say so (v1 only).
@@ -143,6 +146,18 @@ impl Segments {
     }
 }
 
+impl Segments {
+    /// Name, place in the split and places of the frames of a segment.
+    fn numbers(&self, owner: usize) -> Option<(&str, usize, &[usize])> {
+        match self {
+            Self::V1 { list, .. } => list.get(owner).map(|s| (s.name.as_str(), s.number, s.frame_numbers.as_slice())),
+            Self::V2(segments) => {
+                segments.list.get(owner).map(|s| (s.name.as_str(), s.number, s.frame_numbers.as_slice()))
+            }
+        }
+    }
+}
+
 impl SceneDataset for Waymo {
     fn len(&self) -> usize {
         self.ranges.last().map_or(0, |range| range.end)
@@ -166,6 +181,16 @@ impl SceneDataset for Waymo {
         Ok(map.around(&segment.map_from_ego(at)?, half_m))
     }
 
+    fn occupancy(&self, index: usize) -> Result<OccupancyGrid, DataError> {
+        let (owner, at) = self.place(index)?;
+        let (Some(labels), Some(set)) = (&self.occupancy, &self.config.occupancy) else {
+            return Err(self.unsupported("occupancy"));
+        };
+        let (name, number, frames) = self.segments.numbers(owner).ok_or_else(|| self.no_frame(index))?;
+        let frame = *frames.get(at).ok_or_else(|| self.no_frame(index))?;
+        labels.read(set.scenes.get(name).copied().unwrap_or(number), frame)
+    }
+
     fn name(&self) -> &str {
         &self.config.name
     }
@@ -176,7 +201,8 @@ impl SceneDataset for Waymo {
             Segments::V1 { .. } => (true, true, true),
             Segments::V2(segments) => (segments.has_boxes(), false, segments.has_text()),
         };
-        Capabilities { boxes, map, text, ..Capabilities::default() }
+        let occupancy = self.occupancy.is_some();
+        Capabilities { boxes, map, text, occupancy, ..Capabilities::default() }
     }
 
     fn max_views(&self) -> usize {

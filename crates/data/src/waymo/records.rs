@@ -21,11 +21,15 @@ use crate::{DataError, EmbeddedPicture};
 #[derive(Debug)]
 pub(super) struct Segment {
     pub name: String,
+    /// Its place among all files of the split.
+    pub number: usize,
     /// Number of wanted cameras.
     pub views: usize,
     file: StoredFile,
     /// Wanted frames in order of time.
     records: Vec<RecordSpan>,
+    /// Their places among all records of the file.
+    pub frame_numbers: Vec<usize>,
     /// The first frame of the file, wanted or not: it holds the map.
     first: Option<RecordSpan>,
 }
@@ -37,19 +41,21 @@ pub(super) fn open(config: &WaymoConfig, store: &Store) -> Result<Vec<Segment>, 
         if let (false, Some(stem)) = (entry.is_folder, entry.name.strip_suffix(".tfrecord")) {
             let context = stem.strip_prefix("segment-").unwrap_or(stem);
             let context = context.strip_suffix("_with_camera_labels").unwrap_or(context);
-            files.push((context.to_owned(), store.file(&config.inside(&entry.name), "segment")?));
+            let file = store.file(&config.inside(&entry.name), "segment")?;
+            files.push((context.to_owned(), (files.len(), file)));
         }
     }
     select(files, &config.scenes, &store.path(&config.inside("")))?
         .into_par_iter()
-        .map(|(name, file)| Segment::open(config, name, file))
+        .map(|(name, (number, file))| Segment::open(config, name, number, file))
         .collect()
 }
 
 impl Segment {
-    fn open(config: &WaymoConfig, name: String, file: StoredFile) -> Result<Self, DataError> {
-        let mut segment = Self { name, views: 0, file: file.clone(), records: Vec::new(), first: None };
-        let mut last = i64::MIN;
+    fn open(config: &WaymoConfig, name: String, number: usize, file: StoredFile) -> Result<Self, DataError> {
+        let (records, frame_numbers) = (Vec::new(), Vec::new());
+        let mut segment = Self { name, number, views: 0, file: file.clone(), records, frame_numbers, first: None };
+        let (mut last, mut frame_number) = (i64::MIN, 0);
         tfrecord::index(&file, head::PEEK, |span, bytes| {
             let micros = match head::look(bytes) {
                 Some(head) => head.micros,
@@ -66,7 +72,9 @@ impl Segment {
             }
             if !config.excludes(micros) {
                 segment.records.push(span);
+                segment.frame_numbers.push(frame_number);
             }
+            frame_number += 1;
             Ok(())
         })?;
         Ok(segment)

@@ -7,13 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use super::REFERENCE_CHANNEL;
 use crate::DataError;
+use crate::store::Roots;
 
 /// Settings of the WayveScenes101 reader.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct WayveScenesConfig {
-    /// Folder that holds one folder per scene.
-    pub root: PathBuf,
+    /// Folder or archive that holds one folder per scene; or a list of both, each with some of the scenes.
+    pub root: Roots,
     /// `train` or `val`, the 84 and 17 scenes of BEV-VAE, or `all` for every scene in the root.
     #[serde(default = "default_split")]
     pub split: String,
@@ -52,7 +53,7 @@ pub struct WayveScenesConfig {
 
 impl WayveScenesConfig {
     /// The defaults for a dataset folder: every scene, every camera, masks on.
-    pub fn new(root: impl Into<PathBuf>) -> Self {
+    pub fn new(root: impl Into<Roots>) -> Self {
         Self {
             root: root.into(),
             split: default_split(),

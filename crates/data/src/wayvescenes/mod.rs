@@ -72,7 +72,7 @@ impl WayveScenes {
     /// asked for by name.
     pub fn open(config: &WayveScenesConfig) -> Result<Self, DataError> {
         config.checked()?;
-        let store = Store::open(&config.root)?;
+        let store = Store::open_all(&config.root)?;
         let names = scene_names(config, &store)?;
         let (baselines, metadata) = read_metadata(config, &store)?;
         let read = |name: &String| Scene::read(&store, name, config, &baselines, &metadata);
@@ -86,7 +86,7 @@ impl WayveScenes {
         let ranges: Vec<Range<usize>> = scenes.iter().map(next).collect();
         if end == 0 && !names.is_empty() {
             let what = format!("the choice of cameras and frames in {} scenes", names.len());
-            return Err(DataError::Empty { what, path: config.root.clone() });
+            return Err(DataError::Empty { what, path: store.path("") });
         }
         Ok(Self { config: config.clone(), store, metadata, scenes, ranges })
     }
@@ -123,7 +123,7 @@ fn scene_names(config: &WayveScenesConfig, store: &Store) -> Result<Vec<String>,
         }
         names.clone_from(&config.scenes);
         for name in &names {
-            checked_name(name, &config.root)?;
+            checked_name(name, &store.path(""))?;
             if !has_model(name) {
                 let path = store.path(&format!("{name}/{}/images.bin", scene::MODEL_FOLDER));
                 return Err(DataError::Missing { what: format!("COLMAP model of {name}"), path });
@@ -131,7 +131,7 @@ fn scene_names(config: &WayveScenesConfig, store: &Store) -> Result<Vec<String>,
         }
     }
     if names.is_empty() && config.split != "all" {
-        return Err(DataError::Empty { what: format!("split {}", config.split), path: config.root.clone() });
+        return Err(DataError::Empty { what: format!("split {}", config.split), path: store.path("") });
     }
     Ok(names)
 }

@@ -3,6 +3,7 @@
 mod broken;
 mod fixture;
 mod forms;
+mod pieces;
 
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};

@@ -39,7 +39,7 @@ fn frames(dataset: &dyn SceneDataset) -> Vec<SceneFrame> {
 fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
     match source? {
         ImageSource::File { file, .. } => Some(file.path()),
-        ImageSource::Rendered { .. } | ImageSource::Embedded { .. } => None,
+        _ => None,
     }
 }
 

@@ -4,6 +4,8 @@ mod archives;
 mod argoverse2;
 mod clips;
 mod colmap;
+mod fuzzed;
+mod generated;
 mod listed;
 mod loader;
 mod npz;

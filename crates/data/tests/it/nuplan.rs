@@ -4,6 +4,7 @@ mod broken;
 mod golden;
 mod made;
 mod malformed;
+mod maps;
 mod reading;
 mod writing;
 

@@ -64,6 +64,6 @@ fn open(config: &NuScenesConfig) -> NuScenes {
 pub fn image_path(source: Option<&ImageSource>) -> Option<&Path> {
     match source? {
         ImageSource::File { file, .. } => Some(file.path()),
-        ImageSource::Rendered { .. } | ImageSource::Embedded { .. } => None,
+        _ => None,
     }
 }

@@ -85,7 +85,7 @@ fn written_labels_are_read_back_and_are_the_same_every_time() {
     let dir = tempfile::tempdir().unwrap();
     let path = write_occ3d(dir.path(), "scene-1077", "token", &grid).unwrap();
     assert_eq!(Occ3d::open(dir.path(), true).unwrap().read("scene-1077", "token").unwrap(), grid);
-    assert_eq!(Occ3d::open(&dir.path().join("gts"), true).unwrap().read("scene-1077", "token").unwrap(), grid);
+    assert_eq!(Occ3d::open(dir.path().join("gts"), true).unwrap().read("scene-1077", "token").unwrap(), grid);
     let again = write_occ3d(dir.path(), "scene-1077", "other", &grid).unwrap();
     assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(again).unwrap());
     assert!(matches!(write_occ3d(dir.path(), "scene-1077", "token", &grid), Err(DataError::Io { .. })));
@@ -256,4 +256,34 @@ fn configs_are_strict() {
     assert_eq!(OCC3D_GRID.checked().unwrap().len(), 640_000);
     assert!((OCC3D_GRID.cell_size() - DVec3::splat(0.4)).length() < 1e-12);
     assert!((WaymoVoxels::Fine.grid().cell_size() - DVec3::new(0.1, 0.1, 0.2)).length() < 1e-12);
+}
+
+#[test]
+fn the_fine_waymo_grid_is_read_whole() {
+    let shape = [1600, 1600, 64];
+    let count: usize = shape.iter().product();
+    let at = |x: usize, y: usize, z: usize| (x * 1600 + y) * 64 + z;
+    let mut labels = vec![23u8; count];
+    labels[at(3, 1500, 60)] = 1;
+    labels[at(1599, 0, 5)] = 13;
+    let mut seen = vec![0u8; count];
+    seen[at(3, 1500, 60)] = 1;
+    let bytes = npz_bytes(&[
+        ("voxel_label", Dtype::U8, &shape, &labels),
+        ("origin_voxel_state", Dtype::U8, &shape, &seen),
+        ("final_voxel_state", Dtype::U8, &shape, &seen),
+        ("infov", Dtype::Bool, &shape, &seen),
+    ]);
+    drop((labels, seen));
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(dir.path().join("007")).unwrap();
+    std::fs::write(dir.path().join("007/042.npz"), bytes.unwrap()).unwrap();
+    let grid = Occ3dWaymo::open(dir.path(), WaymoVoxels::Fine).unwrap().read(7, 42).unwrap();
+    assert_eq!((grid.grid.cells, grid.grid.x_range, grid.grid.z_range), ([64, 1600, 1600], [-80.0, 80.0], [-5.0, 7.8]));
+    assert_eq!(
+        (grid.label([60, 1500, 3]), grid.label([5, 0, 1599]), grid.label([5, 1, 1599])),
+        (Some(1), Some(13), Some(23))
+    );
+    assert_eq!(counts(&grid)["23"], count as u64 - 2);
+    assert_eq!((ones(&grid.lidar_mask), ones(&grid.camera_mask)), (1, 1));
 }

@@ -2,6 +2,7 @@
 
 mod broken;
 mod golden;
+mod labels;
 mod reading;
 mod tables;
 mod writing;

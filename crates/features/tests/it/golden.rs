@@ -47,7 +47,18 @@ impl Golden {
         Some(view.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect())
     }
 
-    fn indices(&self, name: &str) -> Vec<usize> {
+    /// Shape of a tensor that is stored whole.
+    pub fn shape(&self, name: &str) -> Vec<usize> {
+        self.file().tensor(name).unwrap().shape().to_vec()
+    }
+
+    /// Golden values of a parameter, unless the file overrides them.
+    pub fn parameter(&self, name: &str, shape: &[usize]) -> Vec<f32> {
+        let own = self.floats(&format!("override/{name}"));
+        own.unwrap_or_else(|| nn::golden::golden_values(name, shape))
+    }
+
+    pub fn indices(&self, name: &str) -> Vec<usize> {
         let file = self.file();
         let view = file.tensor(name).unwrap();
         assert_eq!(view.dtype(), Dtype::I64, "{name}");
@@ -71,6 +82,15 @@ impl Golden {
         let worst = errors[errors.len() - 1];
         eprintln!("{name}: error {worst:.1e} of the maximum");
         assert!(worst <= tolerance, "{name}: error {worst} of the maximum");
+    }
+
+    /// Compares a tensor with everything stored of it; `tolerance` is absolute.
+    pub fn check_absolute(&self, name: &str, actual: &[f32], tolerance: f32) {
+        assert!(actual.iter().all(|value| value.is_finite()), "{name}");
+        let (expected, actual) = self.stored(name, actual);
+        let worst = expected.iter().zip(&actual).map(|(e, a)| (e - a).abs()).fold(0.0, f32::max);
+        eprintln!("{name}: error {worst:.1e}");
+        assert!(worst <= tolerance, "{name}: error {worst}");
     }
 
     /// As [`Golden::check`] for a gradient through ReLUs and max pools. Where the input of one is zero up to rounding,
@@ -113,4 +133,25 @@ fn stride(total: usize, kept: usize) -> usize {
     let fits =
         |step: &usize| total.div_ceil(*step) == kept && ![2, 3, 5].iter().any(|factor| step.is_multiple_of(*factor));
     (1..=total).find(fits).unwrap_or_else(|| panic!("no step leaves {kept} of {total} values"))
+}
+
+/// Names and shapes of a golden network's parameters, without the counters beside batch norms.
+pub fn manifest(folder: &Path) -> std::collections::BTreeMap<String, Vec<usize>> {
+    let text = std::fs::read_to_string(folder.join("manifest.json")).unwrap();
+    let manifest: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let parameter = |entry: &serde_json::Value| {
+        let shape = entry["shape"].as_array().unwrap().iter().map(|length| length.as_u64().unwrap() as usize).collect();
+        (entry["name"].as_str().unwrap().to_owned(), shape)
+    };
+    let all = manifest["parameters"].as_array().unwrap().iter().map(parameter);
+    all.filter(|(name, _)| !name.ends_with(".num_batches_tracked")).collect()
+}
+
+/// The folder of the real weights. Without `RIGSCAPE_WEIGHTS` there is none.
+pub fn weights() -> Option<PathBuf> {
+    let folder = std::env::var_os("RIGSCAPE_WEIGHTS").map(PathBuf::from);
+    if folder.is_none() {
+        eprintln!("RIGSCAPE_WEIGHTS is not set: this test did not run");
+    }
+    folder
 }

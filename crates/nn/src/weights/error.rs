@@ -41,13 +41,24 @@ pub enum WeightError {
         /// The file.
         path: PathBuf,
     },
-    /// Only F32, F16 and BF16 hold weights.
-    #[error("tensor {name} has element type {dtype}, expected F32, F16 or BF16: {}", path.display())]
+    /// A tensor asked for as weights holds integers, one asked for as integers holds floats, or its type is a rarer one.
+    #[error(
+        "tensor {name} has element type {dtype}; weights are F64, F32, F16 or BF16, counters and indices BOOL, U8 or I8 to I64: {}",
+        path.display()
+    )]
     ElementType {
         /// The tensor.
         name: String,
         /// Its element type.
         dtype: String,
+        /// The file.
+        path: PathBuf,
+    },
+    /// A torch file is damaged, hostile or holds no state dict.
+    #[error("not a usable torch file: {source}: {}", path.display())]
+    Torch {
+        /// What is wrong.
+        source: TorchFault,
         /// The file.
         path: PathBuf,
     },
@@ -88,6 +99,28 @@ pub enum WeightError {
         /// The file.
         path: PathBuf,
     },
+}
+
+/// What is wrong with a torch file.
+#[derive(Debug, thiserror::Error)]
+pub enum TorchFault {
+    /// The zip archive itself, or the sequence of pickles of an older file.
+    #[error("{0}")]
+    Container(String),
+    /// The pickle that describes the objects.
+    #[error("pickle: {0}")]
+    Pickle(#[from] pickle::PickleError),
+    /// One tensor of the state dict.
+    #[error("tensor {name}: {reason}")]
+    Tensor {
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// There is no state dict where one was looked for.
+    #[error("{0}")]
+    StateDict(String),
 }
 
 impl WeightError {

@@ -1,71 +1,95 @@
-//! Reading and writing safetensors files. Tensors are read on demand; nothing is reserved from a length in the file
-//! before that length has been compared with the bytes that are really there.
+//! An open weight file: which tensors it holds, and reading them on demand.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-use half::{bf16, f16};
 use safetensors::Dtype;
-use safetensors::tensor::{Metadata, TensorInfo, TensorView};
 
-use super::{HostTensor, WeightError};
-
-/// The format's own limit for a header (also the limit of the `safetensors` crate).
-const MAX_HEADER_BYTES: u64 = 100_000_000;
+use super::element::{Widen, integers_of, widen, width};
+use super::{HostTensor, WeightError, safetensors_file, torch};
 
 /// Bytes converted at a time, so that a large tensor is not in memory twice. A multiple of every element size.
-const CHUNK_BYTES: usize = 1 << 20;
+pub(super) const CHUNK_BYTES: usize = 1 << 20;
 
-/// An open safetensors file whose header has been checked.
+/// Where a tensor's values lie in the file.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Entry {
+    pub dtype: Dtype,
+    pub shape: Vec<usize>,
+    /// Byte of the first value.
+    pub start: u64,
+    /// Elements from the first value to the last; the reader of the container has checked that the file holds them.
+    pub span: usize,
+    /// Steps in elements along every axis, when the values are not row-major and dense.
+    pub strides: Option<Vec<usize>>,
+}
+
+/// What a reader of a container found.
+#[derive(Debug, Default)]
+pub(super) struct Contents {
+    pub tensors: BTreeMap<String, Entry>,
+    pub metadata: BTreeMap<String, String>,
+    pub others: Vec<String>,
+}
+
+/// An open weight file whose structure has been checked: safetensors, or what `torch.save` writes (`.pth`, `.pt`, `.ckpt`,
+/// `.bin`; zip archives and the older sequence of pickles). The contents decide, not the name.
+///
+/// Nothing of a torch file is executed: its pickle is decoded as data, and only tensors are taken out of it.
 #[derive(Debug)]
 pub struct WeightFile {
     path: PathBuf,
     file: Mutex<File>,
-    data_start: u64,
-    tensors: BTreeMap<String, TensorInfo>,
-    metadata: BTreeMap<String, String>,
+    contents: Contents,
 }
 
 impl WeightFile {
-    /// Opens a file and checks that header, shapes, byte ranges and file length agree.
+    /// Opens a file and checks that its structure, shapes, byte ranges and length agree.
+    ///
+    /// The state dict of a torch file is its outermost dictionary if that holds tensors, else the entry `state_dict`, else the
+    /// only entry that holds tensors. [`WeightFile::open_nested`] names another one.
     ///
     /// # Errors
-    /// [`WeightError::Io`], [`WeightError::Header`] or [`WeightError::Length`].
+    /// [`WeightError::Io`], [`WeightError::Header`], [`WeightError::Length`] or [`WeightError::Torch`].
     pub fn open(path: impl AsRef<Path>) -> Result<Self, WeightError> {
-        let path = path.as_ref();
+        Self::open_with(path.as_ref(), None)
+    }
+
+    /// Opens the state dict that a torch file holds under these keys, outermost first: `&["model", "ema"]`.
+    ///
+    /// # Errors
+    /// As [`WeightFile::open`], and [`WeightError::Layout`] for a safetensors file, which has no nesting.
+    pub fn open_nested(path: impl AsRef<Path>, keys: &[&str]) -> Result<Self, WeightError> {
+        Self::open_with(path.as_ref(), Some(keys))
+    }
+
+    fn open_with(path: &Path, keys: Option<&[&str]>) -> Result<Self, WeightError> {
         let io = |source| WeightError::Io { source, path: path.to_path_buf() };
-        let header = |reason: String| WeightError::Header { reason, path: path.to_path_buf() };
-
         let mut file = File::open(path).map_err(io)?;
-        let file_bytes = file.metadata().map_err(io)?.len();
-        if file_bytes < 8 {
-            return Err(header(format!("{file_bytes} bytes, the length of the header alone takes 8")));
-        }
-        let mut prefix = [0; 8];
-        file.read_exact(&mut prefix).map_err(io)?;
-        let header_bytes = u64::from_le_bytes(prefix);
-        if header_bytes > MAX_HEADER_BYTES || header_bytes > file_bytes - 8 {
-            return Err(header(format!("header of {header_bytes} bytes announced in a file of {file_bytes}")));
-        }
-        let mut text = vec![0; header_bytes as usize];
-        file.read_exact(&mut text).map_err(io)?;
-        // Deserialising also checks that byte ranges follow each other without gaps and hold exactly their shapes.
-        let parsed: Metadata = serde_json::from_slice(&text).map_err(|error| header(error.to_string()))?;
+        let container = torch::container(&mut file).map_err(io)?;
+        let contents = match (container, keys) {
+            (Some(container), keys) => torch::read(&mut file, container, keys, path)?,
+            (None, None) => safetensors_file::read(&mut file, path)?,
+            (None, Some(keys)) => {
+                let reason = format!("{} was asked for, but only torch files are nested", keys.join("/"));
+                return Err(WeightError::Layout { reason, path: path.to_path_buf() });
+            }
+        };
+        Ok(Self { path: path.to_path_buf(), file: Mutex::new(file), contents })
+    }
 
-        let expected = 8 + header_bytes + parsed.data_len() as u64;
-        if expected != file_bytes {
-            return Err(WeightError::Length { expected, found: file_bytes, path: path.to_path_buf() });
+    /// Takes a prefix off all names, if every name starts with it; else the names stay.
+    #[must_use]
+    pub fn without_prefix(mut self, prefix: &str) -> Self {
+        let tensors = &mut self.contents.tensors;
+        if !tensors.is_empty() && tensors.keys().all(|name| name.starts_with(prefix)) {
+            let shorter = |(name, entry): (String, Entry)| (name[prefix.len()..].to_owned(), entry);
+            *tensors = std::mem::take(tensors).into_iter().map(shorter).collect();
         }
-        Ok(Self {
-            path: path.to_path_buf(),
-            file: Mutex::new(file),
-            data_start: 8 + header_bytes,
-            tensors: parsed.tensors().into_iter().map(|(name, info)| (name, info.clone())).collect(),
-            metadata: parsed.metadata().clone().unwrap_or_default().into_iter().collect(),
-        })
+        self
     }
 
     /// The file that was opened.
@@ -74,63 +98,80 @@ impl WeightFile {
         &self.path
     }
 
-    /// Free text entries of the header.
+    /// Free text entries of a safetensors header.
     #[must_use]
     pub fn metadata(&self) -> &BTreeMap<String, String> {
-        &self.metadata
+        &self.contents.metadata
     }
 
     /// Names of all tensors, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.tensors.keys().map(String::as_str)
+        self.contents.tensors.keys().map(String::as_str)
+    }
+
+    /// Names in the state dict of a torch file that hold something else than a dense tensor.
+    #[must_use]
+    pub fn others(&self) -> &[String] {
+        &self.contents.others
     }
 
     /// Shape of a tensor, if the file holds it.
     #[must_use]
     pub fn shape(&self, name: &str) -> Option<&[usize]> {
-        self.tensors.get(name).map(|info| info.shape.as_slice())
+        self.contents.tensors.get(name).map(|entry| entry.shape.as_slice())
     }
 
-    /// Reads one tensor, widened to f32.
+    /// Whether a tensor holds integers or truth values, which are no weights.
+    #[must_use]
+    pub fn is_integer(&self, name: &str) -> bool {
+        self.contents.tensors.get(name).is_some_and(|entry| integers_of(entry.dtype).is_some())
+    }
+
+    fn entry(&self, name: &str) -> Result<&Entry, WeightError> {
+        let missing = || WeightError::MissingTensor { name: name.to_owned(), path: self.path.clone() };
+        self.contents.tensors.get(name).ok_or_else(missing)
+    }
+
+    fn wrong_type(&self, name: &str, dtype: Dtype) -> WeightError {
+        WeightError::ElementType { name: name.to_owned(), dtype: dtype.to_string(), path: self.path.clone() }
+    }
+
+    /// Reads one tensor of floats, as f32.
     ///
     /// # Errors
     /// [`WeightError::MissingTensor`], [`WeightError::ElementType`], or [`WeightError::Io`] when the file shrank.
     pub fn tensor(&self, name: &str) -> Result<HostTensor, WeightError> {
-        let info = self
-            .tensors
-            .get(name)
-            .ok_or_else(|| WeightError::MissingTensor { name: name.to_owned(), path: self.path.clone() })?;
-        let widen: fn(&[u8], &mut Vec<f32>) = match info.dtype {
-            Dtype::F32 => {
-                |bytes, out| out.extend(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])))
-            }
-            Dtype::F16 => {
-                |bytes, out| out.extend(bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()))
-            }
-            Dtype::BF16 => {
-                |bytes, out| out.extend(bytes.chunks_exact(2).map(|b| bf16::from_le_bytes([b[0], b[1]]).to_f32()))
-            }
-            other => {
-                return Err(WeightError::ElementType {
-                    name: name.to_owned(),
-                    dtype: other.to_string(),
-                    path: self.path.clone(),
-                });
-            }
-        };
-        let data =
-            self.read_range(info, widen).map_err(|source| WeightError::Io { source, path: self.path.clone() })?;
-        Ok(HostTensor { shape: info.shape.clone(), data })
+        let entry = self.entry(name)?;
+        let widen = widen(entry.dtype).ok_or_else(|| self.wrong_type(name, entry.dtype))?;
+        Ok(HostTensor { shape: entry.shape.clone(), data: self.values(entry, widen)? })
     }
 
-    fn read_range(&self, info: &TensorInfo, widen: fn(&[u8], &mut Vec<f32>)) -> std::io::Result<Vec<f32>> {
-        let (start, end) = info.data_offsets;
-        let mut data = Vec::with_capacity(info.shape.iter().product());
-        let mut chunk = vec![0; CHUNK_BYTES.min(end - start)];
+    /// Reads one tensor of integers or truth values: its shape and its values, row-major.
+    ///
+    /// # Errors
+    /// As [`WeightFile::tensor`].
+    pub fn integers(&self, name: &str) -> Result<(Vec<usize>, Vec<i64>), WeightError> {
+        let entry = self.entry(name)?;
+        let widen = integers_of(entry.dtype).ok_or_else(|| self.wrong_type(name, entry.dtype))?;
+        Ok((entry.shape.clone(), self.values(entry, widen)?))
+    }
+
+    fn values<T: Copy>(&self, entry: &Entry, widen: Widen<T>) -> Result<Vec<T>, WeightError> {
+        let read = self.read_span(entry, widen);
+        let values = read.map_err(|source| WeightError::Io { source, path: self.path.clone() })?;
+        Ok(match &entry.strides {
+            None => values,
+            Some(strides) => gather(&values, &entry.shape, strides),
+        })
+    }
+
+    fn read_span<T>(&self, entry: &Entry, widen: Widen<T>) -> std::io::Result<Vec<T>> {
+        let mut data = Vec::with_capacity(entry.span);
+        let mut left = entry.span * width(entry.dtype);
+        let mut chunk = vec![0; CHUNK_BYTES.min(left)];
         // A reader that panicked leaves no broken state behind: every read seeks first.
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        file.seek(SeekFrom::Start(self.data_start + start as u64))?;
-        let mut left = end - start;
+        file.seek(SeekFrom::Start(entry.start))?;
         while left > 0 {
             let part = &mut chunk[..left.min(CHUNK_BYTES)];
             file.read_exact(part)?;
@@ -140,46 +181,44 @@ impl WeightFile {
         Ok(data)
     }
 
-    /// Reads every tensor.
+    /// Reads every tensor of floats; integers are left out.
     ///
     /// # Errors
     /// As [`WeightFile::tensor`].
     pub fn read_all(&self) -> Result<BTreeMap<String, HostTensor>, WeightError> {
-        self.names().map(|name| Ok((name.to_owned(), self.tensor(name)?))).collect()
+        let floats = self.names().filter(|name| !self.is_integer(name));
+        floats.map(|name| Ok((name.to_owned(), self.tensor(name)?))).collect()
     }
 }
 
-/// Writes f32 tensors and text entries. The file appears under its name only when it is complete.
+/// Row-major copy of strided values. Strides fit the values: the reader of the container has checked it.
+fn gather<T: Copy>(values: &[T], shape: &[usize], strides: &[usize]) -> Vec<T> {
+    let mut places = vec![0];
+    for (&length, &stride) in shape.iter().zip(strides) {
+        places = places.iter().flat_map(|&place| (0..length).map(move |step| place + step * stride)).collect();
+    }
+    places.into_iter().filter_map(|place| values.get(place).copied()).collect()
+}
+
+/// Writes a text that belongs to weights. The file appears under its name only when it is complete.
 ///
 /// # Errors
-/// [`WeightError::Write`] for a name given twice or a header beyond the format's limit, [`WeightError::Io`].
-pub fn write_safetensors(
-    path: impl AsRef<Path>,
-    tensors: &[(String, HostTensor)],
-    metadata: &BTreeMap<String, String>,
-) -> Result<(), WeightError> {
-    let path = path.as_ref();
-    let refuse = |reason: String| WeightError::Write { reason, path: path.to_path_buf() };
-    let bytes: Vec<Vec<u8>> =
-        tensors.iter().map(|(_, tensor)| tensor.data.iter().flat_map(|value| value.to_le_bytes()).collect()).collect();
-    let mut views = BTreeMap::new();
-    for ((name, tensor), bytes) in tensors.iter().zip(&bytes) {
-        let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes)
-            .map_err(|error| refuse(format!("{name}: {error}")))?;
-        if views.insert(name.as_str(), view).is_some() {
-            return Err(refuse(format!("{name} is given twice")));
-        }
-    }
-    let metadata: Option<HashMap<_, _>> =
-        (!metadata.is_empty()).then(|| metadata.iter().map(|(key, value)| (key.clone(), value.clone())).collect());
-    safetensors::serialize_to_file(views, metadata, path).map_err(|error| match error {
-        safetensors::SafeTensorError::IoError(source) => WeightError::Io { source, path: path.to_path_buf() },
-        other => refuse(other.to_string()),
-    })
+/// What the operating system says.
+pub fn write_text(path: &Path, text: &str) -> std::io::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    std::fs::write(&part, text)?;
+    std::fs::rename(&part, path)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
+    use half::{bf16, f16};
+
+    use super::super::write_safetensors;
     use super::*;
 
     /// Header text and data behind the length prefix.
@@ -236,6 +275,7 @@ mod tests {
         assert_eq!(open(&header("BF16", "[3]", 6), &bytes).unwrap().tensor("w").unwrap().data, values);
         let integers = open(&header("U8", "[3]", 3), &[1, 2, 3]).unwrap();
         assert!(matches!(integers.tensor("w"), Err(WeightError::ElementType { dtype, .. }) if dtype == "U8"));
+        assert_eq!(integers.integers("w").unwrap(), (vec![3], vec![1, 2, 3]));
     }
 
     #[test]

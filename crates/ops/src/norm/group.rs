@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::moments;
 use crate::activation::{sigmoid, silu_slope};
 use crate::fused::{Kernel, fused_3, on_flex, sum, sum_of_products, vectorized};
+use crate::mean_dim;
 
 /// Group norm: mean and variance over each group of channels and all positions, gain and bias per channel.
 ///
@@ -64,8 +65,8 @@ fn apply<const R: usize>(
         return fused_3(Group { shape: dims.to_vec(), groups, channels: c, area, eps, silu }, x, gain, bias);
     }
     let rows = x.reshape([n * groups, c / groups * area]);
-    let centred = rows.clone() - rows.mean_dim(1);
-    let variance = centred.clone().square().mean_dim(1);
+    let centred = rows.clone() - mean_dim(rows, 1);
+    let variance = mean_dim(centred.clone().square(), 1);
     let normed = (centred / (variance + eps).sqrt()).reshape([n, c, area]);
     let y = (normed * gain.reshape([1, c, 1]) + bias.reshape([1, c, 1])).reshape(dims);
     if silu { activation::silu(y) } else { y }

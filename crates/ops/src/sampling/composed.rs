@@ -6,6 +6,7 @@
 use burn::tensor::{Int, Tensor};
 
 use super::core::{Levels, Sampling};
+use crate::sum_dim;
 
 /// The two neighbours of every point along one axis.
 struct Neighbours {
@@ -21,7 +22,7 @@ pub(super) fn sample_views(levels: &Levels, sampling: Sampling) -> Tensor<3> {
     let q = sampling.offsets.dims()[1];
     let table = sampling.values.clone().reshape([n * v * s * m, c]);
     let visible = sampling.visible.clone().float();
-    let seen = visible.clone().sum_dim(1).clamp_min(1.0).reshape([n, q, 1]);
+    let seen = sum_dim(visible.clone(), 1).clamp_min(1.0).reshape([n, q, 1]);
     let mut total: Option<Tensor<5>> = None;
     for level in 0..levels.extents.len() {
         let sum = sample_level(levels, level, &sampling, &table);
@@ -32,7 +33,7 @@ pub(super) fn sample_views(levels: &Levels, sampling: Sampling) -> Tensor<3> {
     }
     let total = total.expect("a value tensor has at least one level");
     let total = total * visible.reshape([n, v, q, 1, 1]);
-    total.sum_dim(1).reshape([n, q, m * c]) / seen
+    sum_dim(total, 1).reshape([n, q, m * c]) / seen
 }
 
 /// Weighted sum over the points of one level, per view: `[N, V, Q, M, C]`.
@@ -61,7 +62,7 @@ fn sample_level(levels: &Levels, level: usize, sampling: &Sampling, table: &Tens
         let row = site * m as i32 + first.clone();
         let value = table.clone().select(0, row.reshape([n * v * q * m * p]));
         let part = value.reshape([n * v * q * m, p, c]) * weight.reshape([n * v * q * m, p, 1]);
-        let part = part.sum_dim(1).reshape([n, v, q, m, c]);
+        let part = sum_dim(part, 1).reshape([n, v, q, m, c]);
         sum = Some(match sum {
             Some(sum) => sum + part,
             None => part,

@@ -2,8 +2,6 @@
 
 use burn::tensor::Tensor;
 
-use crate::fused::{is_composed_only, on_flex};
-
 use super::core::{Levels, Sampling, sample_views};
 
 /// How a value between pixel centres is read.
@@ -47,12 +45,9 @@ pub fn grid_sample_2d(input: Tensor<4>, grid: Tensor<4>, align_corners: bool, mo
 /// - output: `[N, C, Do, Ho, Wo]`
 ///
 /// # Panics
-/// If the shapes disagree, and on a tape of another backend than `flex`: there the gradient of this composition came out wrong on
-/// wgpu. [`super::deformable_sample_3d`] has right gradients on every backend.
+/// If the shapes disagree.
 #[must_use]
 pub fn grid_sample_3d(input: Tensor<5>, grid: Tensor<5>) -> Tensor<5> {
-    let verified = on_flex(&input) || is_composed_only() || !input.device().is_autodiff();
-    assert!(verified, "grid_sample_3d has a verified gradient on flex only; use deformable_sample_3d");
     let [n, c, d, h, w] = input.dims();
     let [_, od, oh, ow, axes] = grid.dims();
     let levels = Levels::volumes(&[[d, h, w]], 0.0);

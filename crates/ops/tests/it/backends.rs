@@ -16,8 +16,6 @@ fn wave<const D: usize>(shape: [usize; D], phase: f64) -> TensorData {
 struct Probe {
     device: Device,
     results: Vec<(String, Vec<f32>)>,
-    /// `grid_sample_3d` refuses a tape anywhere but on `flex`.
-    taped_volumes: bool,
 }
 
 impl Probe {
@@ -50,9 +48,11 @@ impl Probe {
 
     fn run(mut self) -> Vec<(String, Vec<f32>)> {
         self.elementwise_and_norms();
+        self.affine();
         self.attention();
         self.grids();
         self.deformable();
+        self.sums();
         self.results
     }
 
@@ -77,7 +77,31 @@ impl Probe {
         }
     }
 
+    fn affine(&mut self) {
+        for with_bias in [false, true] {
+            let ((leaf, x), (weight_leaf, weight)) = (self.leaf([2, 7, 24], 0.0), self.leaf([5, 24], 1.0));
+            let (bias_leaf, bias) = self.leaf([5], 2.0);
+            let y = ops::linear(x, weight, with_bias.then_some(bias));
+            self.record("linear", &[&leaf, &weight_leaf, &bias_leaf][..2 + with_bias as usize], y);
+        }
+        for (stride, padding) in [(1, 1), (2, 1)] {
+            let ((leaf, x), (weight_leaf, weight)) = (self.leaf([2, 3, 6, 8], 0.0), self.leaf([4, 3, 3, 3], 1.0));
+            let (bias_leaf, bias) = self.leaf([4], 2.0);
+            let y = ops::conv2d(x, weight, Some(bias), [stride; 2], [padding; 2]);
+            self.record("conv2d", &[&leaf, &weight_leaf, &bias_leaf], y);
+        }
+        let ((leaf, x), (weight_leaf, weight)) = (self.leaf([1, 3, 3, 4, 5], 0.0), self.leaf([2, 3, 3, 3, 3], 1.0));
+        let (bias_leaf, bias) = self.leaf([2], 2.0);
+        let y = ops::conv3d(x, weight, Some(bias), [1; 3], [1; 3]);
+        self.record("conv3d", &[&leaf, &weight_leaf, &bias_leaf], y);
+    }
+
     fn attention(&mut self) {
+        let ((leaf, qkv), (query_leaf, query_gain)) = (self.leaf([2, 5, 48], 0.0), self.leaf([8], 1.0));
+        let (key_leaf, key_gain) = self.leaf([8], 2.0);
+        let angles = Tensor::<3>::from_data(wave([2, 5, 4], 0.2), &self.device);
+        let y = ops::rotary_attention(qkv, [query_gain, key_gain], [angles.clone().cos(), angles.sin()], 2, 1e-6);
+        self.record("rotary_attention", &[&leaf, &query_leaf, &key_leaf], y);
         let mask = self.mask([2, 1, 5, 7], 0.4);
         let some_rows_empty = mask.clone().bool_and(self.mask([2, 1, 5, 1], 9.0).expand([2, 1, 5, 7]));
         for mask in [None, Some(mask), Some(some_rows_empty)] {
@@ -101,11 +125,24 @@ impl Probe {
             let inputs = [&leaf, &grid_leaf];
             self.record("grid_sample_2d", if mode == Interpolation::Nearest { &inputs[..1] } else { &inputs }, y);
         }
-        let ((leaf, input), (grid_leaf, grid)) = (self.leaf([2, 3, 3, 4, 5], 0.0), self.leaf([2, 2, 3, 5, 3], 1.0));
-        if self.taped_volumes {
+        // Odd and even numbers of points: only even ones are computed in vectors on GPUs.
+        for points in [[1, 3, 5], [2, 3, 5], [2, 2, 4]] {
+            let [z, y, x] = points;
+            let (leaf, input) = self.leaf([2, 3, 3, 4, 5], 0.0);
+            let (grid_leaf, grid) = self.leaf([2, z, y, x, 3], 1.0);
             self.record("grid_sample_3d", &[&leaf, &grid_leaf], ops::grid_sample_3d(input, grid * 1.2));
-        } else {
-            self.keep("grid_sample_3d: output".to_owned(), ops::grid_sample_3d(input.inner(), grid.inner() * 1.2));
+            let (leaf, input) = self.leaf([2, 4, 4, 6], 0.0);
+            let (grid_leaf, grid) = self.leaf([2, z * y, x, 2], 1.0);
+            let y = ops::grid_sample_2d(input, grid * 1.2, false, Interpolation::Bilinear);
+            self.record("grid_sample_2d", &[&leaf, &grid_leaf], y);
+        }
+    }
+
+    fn sums(&mut self) {
+        for function in [ops::sum_dim, ops::mean_dim] {
+            let (leaf, x) = self.leaf([2, 3, 16, 4], 0.0);
+            let y = function(x, 1).reshape([2, 16, 4]).swap_dims(1, 2).reshape([2, 4, 4, 4]);
+            self.record("sum along an axis, gradient permuted", &[&leaf], y);
         }
     }
 
@@ -129,14 +166,14 @@ impl Probe {
     }
 }
 
-fn probe(device: Device, taped_volumes: bool) -> Vec<(String, Vec<f32>)> {
-    Probe { device: device.autodiff(), results: Vec::new(), taped_volumes }.run()
+fn probe(device: Device) -> Vec<(String, Vec<f32>)> {
+    Probe { device: device.autodiff(), results: Vec::new() }.run()
 }
 
 /// All values are of order 1 and at most some hundred f32 products are summed, so 2e-5 leaves an order of magnitude over
 /// rounding; sampling positions are the same f32 numbers on every backend.
-fn compare(other: Vec<(String, Vec<f32>)>, taped_volumes: bool) {
-    let fused = probe(Device::flex(), taped_volumes);
+fn compare(other: Vec<(String, Vec<f32>)>) {
+    let fused = probe(Device::flex());
     assert_eq!(fused.len(), other.len());
     let mut wrong = Vec::new();
     for ((name, a), (_, b)) in fused.iter().zip(&other) {
@@ -152,7 +189,7 @@ fn compare(other: Vec<(String, Vec<f32>)>, taped_volumes: bool) {
 
 #[test]
 fn composition_agrees() {
-    compare(ops::composed_only(|| probe(Device::flex(), true)), true);
+    compare(ops::composed_only(|| probe(Device::flex())));
 }
 
 #[cfg(feature = "ndarray")]
@@ -160,11 +197,11 @@ fn composition_agrees() {
 fn ndarray_agrees() {
     // Deprecated upstream, still a supported choice here.
     #[allow(deprecated)]
-    compare(probe(Device::ndarray(), false), false);
+    compare(probe(Device::ndarray()));
 }
 
 #[cfg(feature = "wgpu")]
 #[test]
 fn wgpu_agrees() {
-    compare(probe(Device::wgpu(burn::tensor::DeviceKind::DefaultDevice), false), false);
+    compare(probe(Device::wgpu(burn::tensor::DeviceKind::DefaultDevice)));
 }

@@ -52,14 +52,15 @@ pub struct Evaluator {
 
 /// PSNR collectors of the model and its rivals on the same pictures.
 #[derive(Default)]
-struct Contest {
-    model: Psnr,
-    mean: Psnr,
-    nearest: Psnr,
+pub(crate) struct Contest {
+    pub model: Psnr,
+    pub mean: Psnr,
+    pub nearest: Psnr,
 }
 
 impl Contest {
-    fn scores(&self) -> Option<Scores> {
+    /// None before the first picture.
+    pub fn scores(&self) -> Option<Scores> {
         let db = |psnr: &Psnr| psnr.summary().mean_db;
         let (psnr_db, nearest_view_db) = (db(&self.model)?, db(&self.nearest));
         let mean_image_db = db(&self.mean).unwrap_or(f64::NEG_INFINITY);

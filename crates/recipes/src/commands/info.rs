@@ -1,9 +1,10 @@
-//! `rigscape info`: sizes of presets, experiments and checkpoints.
+//! `rigscape info`: sizes of presets, experiments and checkpoints, and the known weight files.
 
 use std::path::PathBuf;
 
 use burn::module::Module;
 use clap::Parser;
+use features::{KNOWN_WEIGHTS, KnownWeights};
 use nn::Init;
 use train::{DeviceConfig, find_checkpoint};
 use vae::{BevVae, BevVaeConfig, Discriminator, Preset};
@@ -12,7 +13,7 @@ use super::common::say;
 use crate::bev_vae::Experiment;
 use crate::{ModelChoice, config_file};
 
-/// Print the sizes of a preset, of an experiment's model, or what a checkpoint holds
+/// Print the sizes of a preset, of an experiment's model, what a checkpoint holds, or which weight files are known
 #[derive(Debug, Parser)]
 pub struct InfoArgs {
     /// Preset: debug, tiny, small or paper
@@ -24,6 +25,9 @@ pub struct InfoArgs {
     /// Run folder or checkpoint folder
     #[arg(long, value_name = "DIR")]
     pub checkpoint: Option<PathBuf>,
+    /// List the weight files that metrics and losses know: where they come from, licence, stand-ins
+    #[arg(long, conflicts_with_all = ["preset", "config", "checkpoint"])]
+    pub weights: bool,
 }
 
 fn parse_preset(text: &str) -> Result<Preset, String> {
@@ -36,6 +40,9 @@ fn parse_preset(text: &str) -> Result<Preset, String> {
 /// # Errors
 /// Unreadable files.
 pub fn info(args: &InfoArgs) -> anyhow::Result<()> {
+    if args.weights {
+        return KNOWN_WEIGHTS.iter().try_for_each(list_weights);
+    }
     if let Some(path) = &args.checkpoint {
         let reader = find_checkpoint(path)?;
         let state = reader.state();
@@ -60,6 +67,18 @@ pub fn info(args: &InfoArgs) -> anyhow::Result<()> {
         None => [Preset::Debug, Preset::Tiny, Preset::Small, Preset::Paper]
             .into_iter()
             .try_for_each(|preset| describe(&ModelChoice::from(preset))),
+    }
+}
+
+fn list_weights(known: &KnownWeights) -> anyhow::Result<()> {
+    let bytes = known.bytes.map_or_else(|| "size not recorded".to_owned(), |bytes| format!("{bytes} bytes"));
+    say(format_args!("{}: {bytes}, sha256 {}", known.file, known.sha256.unwrap_or("not recorded")))?;
+    say(format_args!("  for      {}", known.metric))?;
+    say(format_args!("  from     {}", known.source))?;
+    say(format_args!("  licence  {}", known.licence))?;
+    match known.stand_in {
+        Some(other) => say(format_args!("  or use   {}, then the number is called {}", other.file, other.metric)),
+        None => Ok(()),
     }
 }
 

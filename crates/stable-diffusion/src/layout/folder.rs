@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::tensor::Device;
 use nn::Init;
-use nn::weights::{Mismatch, WeightError, WeightFile, write_safetensors};
+use nn::weights::{Mismatch, WeightError, WeightFile, write_safetensors, write_text};
 use serde_json::{Map, Value};
 
 use super::json;
@@ -237,5 +237,5 @@ pub fn save_folder<N: Network>(network: &N, folder: impl AsRef<Path>) -> Result<
     write_safetensors(folder.join(WEIGHTS_FILE), &state_dict_params(network)?, &metadata)?;
     let path = folder.join(CONFIG_FILE);
     let text = format!("{:#}\n", Value::Object(N::config_to_json(network.sizes())));
-    std::fs::write(&path, text).map_err(io(&path))
+    write_text(&path, &text).map_err(io(&path))
 }

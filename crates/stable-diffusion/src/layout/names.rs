@@ -24,18 +24,25 @@ pub fn state_dict_name(path: &str) -> String {
     path.split('.').filter(is_level).map(rename).collect::<Vec<_>>().join(".")
 }
 
-/// State-dict names and shapes of all parameters, without touching their values.
-#[must_use]
-pub fn state_dict_shapes<M: Module>(module: &M) -> Vec<(String, Vec<usize>)> {
-    param_shapes(module).into_iter().map(|(path, shape)| (state_dict_name(&path), shape)).collect()
+/// Adapters lie beside the weights they adapt; they have files of their own ([`nn::lora::save`]).
+fn is_base<T>((path, _): &(String, T)) -> bool {
+    path.split('.').all(|segment| segment != "lora")
 }
 
-/// All parameters under their state-dict names.
+/// State-dict names and shapes of all parameters but adapters, without touching their values.
+#[must_use]
+pub fn state_dict_shapes<M: Module>(module: &M) -> Vec<(String, Vec<usize>)> {
+    let base = param_shapes(module).into_iter().filter(is_base);
+    base.map(|(path, shape)| (state_dict_name(&path), shape)).collect()
+}
+
+/// All parameters but adapters under their state-dict names.
 ///
 /// # Errors
 /// [`WeightError::Readback`] when a device fails.
 pub fn state_dict_params<M: Module>(module: &M) -> Result<Vec<(String, HostTensor)>, WeightError> {
-    Ok(named_params(module)?.into_iter().map(|(path, tensor)| (state_dict_name(&path), tensor)).collect())
+    let base = named_params(module)?.into_iter().filter(is_base);
+    Ok(base.map(|(path, tensor)| (state_dict_name(&path), tensor)).collect())
 }
 
 /// Replaces every parameter by the values that `values(state-dict name, shape)` returns for it, if any.

@@ -1,13 +1,14 @@
-//! The original layout of Stable Diffusion and ControlNet: several networks in one safetensors file, each behind a prefix.
+//! The original layout of Stable Diffusion and ControlNet: several networks in one file, each behind a prefix.
 //!
 //! Source: CompVis/latent-diffusion and lllyasviel/ControlNet, whose networks number their layers one after the other.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
-use nn::weights::{WeightError, WeightFile};
+use nn::weights::{HostTensor, WeightError, WeightFile, write_safetensors};
 
 use super::folder::{Network, load_named};
-use super::names::state_dict_shapes;
+use super::names::{state_dict_params, state_dict_shapes};
 use crate::controlnet::ControlNet;
 use crate::unet::{EncoderConfig, UNet2DCondition};
 use crate::vae::AutoencoderKL;
@@ -34,6 +35,28 @@ pub fn load_single_file<N: SingleFileNetwork>(network: N, file: &WeightFile) -> 
     let in_file = file.names().filter(|name| name.starts_with(N::PREFIX));
     let names = in_file.map(|name| (ours.get(name).cloned().unwrap_or_else(|| name.to_owned()), name.to_owned()));
     Ok(load_named(network, file, &names.collect(), &[])?.0)
+}
+
+/// A network's tensors under their names in a single file, for [`save_single_file`].
+///
+/// # Errors
+/// [`WeightError::Readback`] when a device fails.
+pub fn single_file_tensors<N: SingleFileNetwork>(network: &N) -> Result<Vec<(String, HostTensor)>, WeightError> {
+    let renamed = |(name, mut tensor): (String, HostTensor)| {
+        if N::was_convolution(&name) && tensor.shape.len() == 2 {
+            tensor.shape.extend([1, 1]);
+        }
+        (format!("{}{}", N::PREFIX, network.original_name(&name)), tensor)
+    };
+    Ok(state_dict_params(network)?.into_iter().map(renamed).collect())
+}
+
+/// Writes the tensors of any number of networks as one file, in f32.
+///
+/// # Errors
+/// [`WeightError`] for a name that occurs twice, or when the file system fails.
+pub fn save_single_file(path: impl AsRef<Path>, tensors: &[(String, HostTensor)]) -> Result<(), WeightError> {
+    write_safetensors(path, tensors, &BTreeMap::from([("format".to_owned(), "pt".to_owned())]))
 }
 
 /// The first two numbers of `rest` as in `i.resnets.j.tail`, the kind between them and the tail.

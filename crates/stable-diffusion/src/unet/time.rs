@@ -9,13 +9,19 @@ const LONGEST: f64 = 10_000.0;
 
 /// Cosines, then sines, of t·10000^(−j/(width/2)).
 ///
+/// Angles are rounded as PyTorch rounds them: published weights know no others. At t = 981 exact angles would change the code by
+/// 2e-5 and gradients of the network by 2e-4.
+///
 /// # Shapes
 /// - output: `[N, width]`, `width` even
 pub fn time_code(timesteps: &[f64], width: usize, device: &Device) -> Tensor<2> {
     let half = width / 2;
-    let frequency = |j: usize| (-LONGEST.ln() * j as f64 / half as f64).exp();
+    let frequency = |j: usize| {
+        let exponent = -LONGEST.ln() as f32 * j as f32 / half as f32;
+        f64::from(exponent).exp() as f32
+    };
     let row = |t: &f64| {
-        let angles: Vec<f64> = (0..half).map(|j| t * frequency(j)).collect();
+        let angles: Vec<f64> = (0..half).map(|j| f64::from(*t as f32 * frequency(j))).collect();
         let cosines: Vec<f64> = angles.iter().map(|a| a.cos()).collect();
         cosines.into_iter().chain(angles.into_iter().map(f64::sin)).map(|v| v as f32).collect::<Vec<_>>()
     };

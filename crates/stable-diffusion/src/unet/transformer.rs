@@ -4,12 +4,12 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use nn::{Bias, GroupNorm, Init, Linear};
+use nn::{Bias, GroupNorm, Init, LayerNorm, Linear};
 
 use super::{Condition, EncoderConfig, ProjectionKind};
 use crate::attention::Attention;
 use crate::cross_view::CrossView;
-use crate::layers::{Conv2d, LayerNorm};
+use crate::layers::Conv2d;
 use crate::panels::{join_width, split_width};
 
 /// Epsilon of the group norm at the entrance; residual blocks have another.
@@ -40,10 +40,8 @@ impl Projection {
         match self {
             Self::Linear(linear) => linear.forward(tokens),
             Self::Convolution(conv) => {
-                let [n, positions, width] = tokens.dims();
-                let matrix = conv.weight.val().reshape([width, width]).transpose();
-                let y = tokens.reshape([n * positions, width]).matmul(matrix) + conv.bias.val().unsqueeze::<2>();
-                y.reshape([n, positions, width])
+                let matrix = conv.lora.matrix(&conv.weight);
+                conv.lora.add_to_rows(tokens, |tokens| ops::linear(tokens, matrix, Some(conv.bias.val())))
             }
         }
     }
@@ -97,12 +95,12 @@ pub struct TransformerBlock {
 impl TransformerBlock {
     fn new(width: usize, heads: usize, config: &EncoderConfig, init: &mut Init) -> Self {
         Self {
-            norm1: LayerNorm::new(width, BLOCK_EPSILON, init),
+            norm1: LayerNorm::with_bias(width, BLOCK_EPSILON, init),
             attn1: Attention::new(width, width, heads, Bias::Without, init),
-            norm2: LayerNorm::new(width, BLOCK_EPSILON, init),
+            norm2: LayerNorm::with_bias(width, BLOCK_EPSILON, init),
             attn2: Attention::new(width, config.context_width, heads, Bias::Without, init),
             cross_view: config.cross_view.map(|merge| CrossView::new(width, heads, merge, init)),
-            norm3: LayerNorm::new(width, BLOCK_EPSILON, init),
+            norm3: LayerNorm::with_bias(width, BLOCK_EPSILON, init),
             ff: FeedForward::new(width, init),
         }
     }

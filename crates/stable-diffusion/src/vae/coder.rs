@@ -186,6 +186,11 @@ impl Decoder {
     /// - latents: `[N, latent, h, w]`
     /// - output: `[N, 3, h·f, w·f]`, not clamped
     pub fn forward(&self, latents: Tensor<4>) -> Tensor<4> {
+        self.conv_out.forward(self.features(latents))
+    }
+
+    /// What enters the last convolution, `[N, C, h·f, w·f]`.
+    pub fn features(&self, latents: Tensor<4>) -> Tensor<4> {
         let x = self.mid_block.forward(self.conv_in.forward(latents));
         let x = self.up_blocks.iter().fold(x, |x, block| {
             let x = through(&block.resnets, x);
@@ -195,7 +200,7 @@ impl Decoder {
                 None => x,
             }
         });
-        self.conv_out.forward(self.conv_norm_out.forward_silu(x))
+        self.conv_norm_out.forward_silu(x)
     }
 }
 

@@ -8,6 +8,7 @@ use nn::Init;
 
 use super::coder::{Decoder, Encoder};
 use super::{Posterior, Tiling, VaeConfig};
+use crate::config::ConfigError;
 use crate::layers::Conv2d;
 
 /// Pictures to latents an f-th of their size, and back.
@@ -43,6 +44,15 @@ impl AutoencoderKL {
         &self.config
     }
 
+    /// The same weights with another scale of the latents, as measured after training.
+    ///
+    /// # Errors
+    /// [`ConfigError`] for a scale that is no positive number.
+    pub fn with_scaling_factor(self, scaling_factor: f64) -> Result<Self, ConfigError> {
+        let config = VaeConfig { scaling_factor, ..self.config.clone() }.checked()?;
+        Ok(Self { config, ..self })
+    }
+
     /// # Shapes
     /// - images: `[N, 3, H, W]` in [−1, 1], H and W multiples of f
     /// - output: moments of `[N, latent, H/f, W/f]`, not scaled
@@ -65,6 +75,11 @@ impl AutoencoderKL {
     /// - output: `[N, 3, h·f, w·f]`, about [−1, 1], not clamped
     pub fn decode(&self, latents: Tensor<4>) -> Tensor<4> {
         self.decoder.forward(self.post_quant_conv.forward(latents))
+    }
+
+    /// What enters the decoder's last convolution, `[N, C, h·f, w·f]`; shapes else as for `decode`.
+    pub fn decode_features(&self, latents: Tensor<4>) -> Tensor<4> {
+        self.decoder.features(self.post_quant_conv.forward(latents))
     }
 
     /// [`AutoencoderKL::decode`], `items` of the batch at a time: the same pictures with less memory.

@@ -38,6 +38,6 @@ impl Posterior {
         let [n, c, h, w] = self.mean.dims();
         let variance = self.log_var.clone().exp();
         let terms = self.mean.clone().square() + variance - 1.0 - self.log_var.clone();
-        (terms.reshape([n, c * h * w]).sum_dim(1) * 0.5).squeeze_dim(1)
+        (ops::sum_dim(terms.reshape([n, c * h * w]), 1) * 0.5).squeeze_dim(1)
     }
 }

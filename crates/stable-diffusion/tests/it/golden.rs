@@ -101,6 +101,7 @@ pub fn values_of<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
 fn values(dtype: Dtype, bytes: &[u8]) -> Vec<f32> {
     match dtype {
         Dtype::F32 => bytes.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect(),
+        Dtype::F64 => bytes.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap()) as f32).collect(),
         Dtype::I64 => bytes.chunks_exact(8).map(|b| i64::from_le_bytes(b.try_into().unwrap()) as f32).collect(),
         Dtype::U8 => bytes.iter().map(|b| f32::from(*b)).collect(),
         other => panic!("unexpected element type {other:?}"),

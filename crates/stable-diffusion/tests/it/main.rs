@@ -5,6 +5,8 @@ mod cross_view;
 mod folder;
 mod full_size;
 mod golden;
+mod lora;
 mod single_file;
+mod text;
 mod unet;
 mod vae;

@@ -6,7 +6,9 @@ use burn::module::Module;
 use burn::tensor::Device;
 use nn::Init;
 use nn::weights::{HostTensor, WeightError, WeightFile, write_safetensors};
-use stable_diffusion::layout::single_file::{SingleFileNetwork, load_single_file};
+use stable_diffusion::layout::single_file::{
+    SingleFileNetwork, load_single_file, save_single_file, single_file_tensors,
+};
 use stable_diffusion::layout::{state_dict_params, state_dict_shapes};
 use stable_diffusion::{AutoencoderKL, ControlNet, Preset, UNet2DCondition};
 
@@ -150,4 +152,21 @@ fn leftovers_behind_the_prefix_are_listed() {
     assert!(mismatch.wrong_shape.is_empty());
     assert_eq!(mismatch.path.as_deref(), Some(path.as_path()));
     assert_eq!(unet.num_params(), all.iter().map(|(_, t)| t.data.len()).sum::<usize>() + 4 - 1);
+}
+
+#[test]
+fn several_networks_share_a_file_both_ways() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("all.safetensors");
+    let unet = golden_weights(UNet2DCondition::new(&Preset::Debug.unet(), &mut lazy()));
+    let vae = golden_weights(AutoencoderKL::new(&Preset::Debug.vae(), &mut lazy()));
+    let tensors = [single_file_tensors(&unet).unwrap(), single_file_tensors(&vae).unwrap()].concat();
+    save_single_file(&path, &tensors).unwrap();
+    let file = WeightFile::open(&path).unwrap();
+    let query = "first_stage_model.encoder.mid.attn_1.q.weight";
+    assert_eq!(file.shape(query), Some(&[16, 16, 1, 1][..]), "published files hold a convolution here");
+    let again = load_single_file(UNet2DCondition::new(&Preset::Debug.unet(), &mut lazy()), &file).unwrap();
+    assert_eq!(state_dict_params(&again).unwrap(), state_dict_params(&unet).unwrap());
+    let again = load_single_file(AutoencoderKL::new(&Preset::Debug.vae(), &mut lazy()), &file).unwrap();
+    assert_eq!(state_dict_params(&again).unwrap(), state_dict_params(&vae).unwrap());
 }

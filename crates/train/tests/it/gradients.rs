@@ -100,6 +100,38 @@ fn an_update_keeps_tape_settings_and_untouched_parameters() {
 }
 
 #[test]
+fn learning_rate_factors_reach_their_parameters_alone() {
+    let device = Device::flex().autodiff();
+    let pair = pair(&device);
+    let config = |factors: &[(&str, f64)]| OptimizerConfig {
+        eps: 0.0,
+        weight_decay: 0.0,
+        learning_rate_factors: factors.iter().map(|&(path, factor)| (path.to_string(), factor)).collect(),
+        ..OptimizerConfig::default()
+    };
+    let tripled = config(&[("table", 3.0)]);
+    tripled.check(&pair).unwrap();
+    let loss = pair.table.val().sum() + pair.gain.val().sum();
+    let mut grads = GradientsParams::from_grads(loss.backward(), &pair);
+    let updated = AdamW::new(&tripled).step(pair.clone(), &mut grads, 0.1);
+    // Without eps and decay the first step is lr·sign(g).
+    let moved = |new: Vec<f32>, old: Vec<f32>| new.iter().zip(&old).map(|(new, old)| old - new).collect::<Vec<_>>();
+    let values = |pair: &Pair| {
+        let [table, gain] = [pair.table.val().into_data(), pair.gain.val().into_data()];
+        (table.try_to_vec::<f32>().unwrap(), gain.try_to_vec::<f32>().unwrap())
+    };
+    let (before, after) = (values(&pair), values(&updated));
+    assert!(moved(after.0, before.0).iter().all(|change| (change - 0.3).abs() < 1e-6));
+    assert!(moved(after.1, before.1).iter().all(|change| (change - 0.1).abs() < 1e-6));
+    // A part of a name is no path.
+    for unknown in ["tab", "table.weight", ""] {
+        let error = config(&[(unknown, 2.0)]).check(&pair).unwrap_err().to_string();
+        assert!(error.contains("learning_rate_factors"), "{error}");
+    }
+    assert!(config(&[("table", f64::NAN)]).check(&pair).is_err());
+}
+
+#[test]
 fn paths_and_shapes_follow_the_fields() {
     let pair = pair(&Device::flex());
     let listed: Vec<(String, Vec<usize>)> =

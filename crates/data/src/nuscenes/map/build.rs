@@ -5,10 +5,10 @@ use std::path::Path;
 
 use geometry::glam::DVec2;
 
-use super::outline::{self, doubled_area};
 use super::rows::{AreaRow, DividerRow, MapFile, PolygonRow};
 use super::{Arcline, CityMap, Divider, FARTHEST_M, LanePath, LayerArea, MapLayer, MapPolygon};
 use crate::DataError;
+use crate::polygon::{doubled_area, union};
 use crate::store::StoredFile;
 
 /// Polygons that enclose less are degenerate, square metres.
@@ -50,7 +50,7 @@ pub(super) fn read(file: &StoredFile) -> Result<CityMap, DataError> {
     }
     map.paths = paths(&rows, path)?;
     let drivable = map.areas.iter().filter(|area| area.layer == MapLayer::DrivableArea);
-    map.drivable = outline::union(drivable.flat_map(|area| &area.polygons));
+    map.drivable = union(drivable.flat_map(|area| &area.polygons));
     Ok(map)
 }
 

@@ -2,7 +2,6 @@
 
 mod arcline;
 mod build;
-mod outline;
 mod prior;
 mod rows;
 
@@ -12,7 +11,9 @@ use geometry::glam::DVec2;
 pub use arcline::Arcline;
 pub use prior::MapPrior;
 
-use crate::local_map::{LocalMapBuilder, contains};
+pub use crate::polygon::MapPolygon;
+
+use crate::local_map::LocalMapBuilder;
 use crate::store::StoredFile;
 use crate::{DataError, LocalMap, MapKind};
 
@@ -50,22 +51,6 @@ impl MapLayer {
             Self::CarparkArea => "carpark_area",
             Self::LaneConnector => "lane_connector",
         }
-    }
-}
-
-/// A polygon; rings do not repeat their first point.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct MapPolygon {
-    /// Outer ring, metres.
-    pub outer: Vec<DVec2>,
-    /// Inner rings, metres.
-    pub holes: Vec<Vec<DVec2>>,
-}
-
-impl MapPolygon {
-    /// Whether a point lies in it and in none of its holes.
-    pub fn contains(&self, point: DVec2) -> bool {
-        contains(&self.outer, point) && !self.holes.iter().any(|hole| contains(hole, point))
     }
 }
 

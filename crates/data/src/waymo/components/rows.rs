@@ -117,11 +117,8 @@ impl Segment {
     }
 }
 
-pub(super) fn read_poses(
-    config: &WaymoConfig,
-    segment: &str,
-    file: StoredFile,
-) -> Result<Vec<(i64, Rigid)>, DataError> {
+/// All frames of a segment in order of time.
+pub(super) fn read_poses(segment: &str, file: StoredFile) -> Result<Vec<(i64, Rigid)>, DataError> {
     let transform = column("VehiclePose", "world_from_vehicle.transform");
     let columns = read(&ParquetFile::open(file)?, segment, &[STAMP, &transform])?;
     let poses = columns.filled(&transform, columns.lists(&transform)?)?;
@@ -134,7 +131,6 @@ pub(super) fn read_poses(
         let token = twice[0].0.to_string();
         return Err(DataError::DuplicateToken { table: "vehicle_pose", token, path: columns.path().to_owned() });
     }
-    frames.retain(|frame| !config.excludes(frame.0));
     Ok(frames)
 }
 

@@ -16,7 +16,7 @@ fn chain(root: impl Into<Roots>, scene: &str, frames: FrameChoice) -> NuScenesCo
 fn bytes(view: &View) -> Option<Vec<u8>> {
     match view.image.as_ref()? {
         ImageSource::File { file, .. } => Some(file.bytes().unwrap()),
-        ImageSource::Rendered { .. } | ImageSource::Embedded { .. } => None,
+        _ => None,
     }
 }
 

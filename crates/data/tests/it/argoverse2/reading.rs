@@ -113,7 +113,7 @@ fn boxes_are_filtered_only_when_asked() {
     let Some(base) = config(|_| ()) else { return };
     let count = |config: &Argoverse2Config| open(config).frame(0).unwrap().boxes.unwrap();
     let all = count(&base);
-    let annotations = base.root.join("sensor/val").join(LOG).join("annotations.feather");
+    let annotations = base.root.as_slice()[0].path.join("sensor/val").join(LOG).join("annotations.feather");
     let stamps = tables::integers(&annotations, "timestamp_ns");
     assert_eq!(all.len(), stamps.iter().filter(|stamp| **stamp == 315_966_265_259_836_000).count());
     let near = count(&Argoverse2Config { max_range_m: Some(50.0), ..base.clone() });
@@ -128,7 +128,7 @@ fn boxes_are_filtered_only_when_asked() {
 #[test]
 fn velocities_are_central_differences_over_the_track() {
     let Some(base) = config(|_| ()) else { return };
-    let log = base.root.join("sensor/val").join(LOG);
+    let log = base.root.as_slice()[0].path.join("sensor/val").join(LOG);
     let annotations = log.join("annotations.feather");
     let stamps = tables::integers(&annotations, "timestamp_ns");
     let tracks = tables::texts(&annotations, "track_uuid");

@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use data::nuplan::{NuPlan, NuPlanConfig, check};
-use data::pickle::{encode_floats, encode_rows};
 use data::taxonomy::ClassRule;
 use data::{DataError, SceneDataset, SceneFrame};
+use pickle::{encode_floats, encode_rows};
 use rand::{RngExt, SeedableRng};
 
 use super::made::Made;

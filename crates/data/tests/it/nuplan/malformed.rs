@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use data::DataError;
 use data::nuplan::{NuPlan, NuPlanConfig};
-use data::pickle::{PickleError, Rules, decode};
+use pickle::{PickleError, Rules, decode};
 
 use super::{frames, variant};
 use crate::nuscenes::folder;
