@@ -112,9 +112,13 @@ fn mistakes_are_refused_with_the_place_and_the_cure() {
     std::fs::create_dir_all(&empty).unwrap();
     let missing = with(&["--protocol", "fid/plain", "--weights", &empty]);
     assert!(missing.contains("no weights") && missing.contains("empty"), "{missing}");
-    std::fs::write(Path::new(&empty).join("vgg16_conv_f16.safetensors"), b"these are no weights").unwrap();
+    std::fs::write(Path::new(&empty).join("efficientnet_lite0_imagenet.safetensors"), b"these are no weights").unwrap();
     let wrong = with(&["--protocol", "fid/plain", "--weights", &empty]);
-    assert!(wrong.contains("vgg16_conv_f16.safetensors"), "{wrong}");
+    assert!(wrong.contains("efficientnet_lite0_imagenet.safetensors"), "{wrong}");
+
+    std::fs::write(Path::new(&empty).join("pt_inception-2015-12-05-6726825d.pth"), b"another file").unwrap();
+    let wrong = with(&["--protocol", "fid/plain", "--weights", &empty]);
+    assert!(wrong.contains("pt_inception"), "{wrong}");
 
     let other = sets.folder.path().join("other");
     write_pictures(&other, &NAMES, (32, 48), 0);
@@ -186,7 +190,7 @@ fn a_dataset_against_itself_has_consistent_views() {
     let found = report(&out);
     assert_eq!((found["frames"].as_u64(), found["pictures"].as_u64()), (Some(2), Some(12)));
     let mvsc = found["metrics"][0].clone();
-    assert!(mvsc["name"].as_str().unwrap().starts_with("mvsc-"), "{mvsc}");
+    assert!(mvsc["name"].as_str().unwrap().starts_with("mvsc_proxy("), "{mvsc}");
     assert!(mvsc["notes"].to_string().contains("24 pairs of views"), "{mvsc}");
     let same = mvsc["value"].is_null() || mvsc["value"].as_f64() == Some(1.0);
     assert!(same, "equal sides: {mvsc}");

@@ -12,8 +12,8 @@ use metrics::{
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rigscape::evaluate::{
-    Curve, DatasetPictures, Instant, Loaded, NetworkFolder, PictureNetwork, PictureSource, Pictures, SeamMatcher, Shot,
-    draw_curves, measure, network_input,
+    Curve, DatasetPictures, FeatureNetwork, Instant, Loaded, NetworkFolder, PictureSource, Pictures, ScalarMetric,
+    SeamMatcher, Shot, draw_curves, network_input,
 };
 use rigscape::sheet::save_picture;
 
@@ -73,8 +73,8 @@ fn each(instant: &Instant, change: impl Fn(&Raster<u8>) -> Raster<u8>) -> Instan
 }
 
 struct Instruments {
-    pairs: Vec<Protocol>,
-    network: Loaded<dyn PictureNetwork>,
+    pairs: Vec<ScalarMetric>,
+    network: Loaded<dyn FeatureNetwork>,
     matcher: Loaded<dyn SeamMatcher>,
 }
 
@@ -111,11 +111,14 @@ impl Instruments {
     /// Names, values, and whether higher is better.
     fn measure(&self, real: &Instant, changed: &Instant) -> Vec<(String, f64, bool)> {
         let mut found = Vec::new();
-        for protocol in &self.pairs {
+        for scalar in &self.pairs {
             let views = real.views.iter().zip(&changed.views);
-            let values = views.map(|(real, changed)| measure(protocol, &real.picture, &changed.picture).unwrap());
+            let values = views.map(|(real, changed)| scalar.measure(&real.picture, &changed.picture).unwrap());
             let mean = values.map(|value| value.min(100.0)).sum::<f64>() / real.views.len() as f64;
-            found.push((protocol.name.clone(), mean, true));
+            let stand_in = scalar.network.as_ref().and_then(|loaded| loaded.stand_in.clone());
+            let name =
+                stand_in.map_or(scalar.protocol.name.clone(), |network| format!("perceptual_distance({network})"));
+            found.push((name, mean, scalar.network.is_none()));
         }
         let width = self.network.network.width();
         let (real_rows, changed_rows) = (self.rows(real), self.rows(changed));
@@ -131,7 +134,7 @@ impl Instruments {
         let kernel = polynomial_mmd(&table(changed_rows), &table(real_rows)).unwrap();
         found.push((format!("kid-{network}"), kernel, false));
         let matcher = self.matcher.stand_in.clone().unwrap_or_default();
-        found.push((format!("mvsc-{matcher}"), self.consistency(changed) / self.consistency(real), true));
+        found.push((format!("mvsc_proxy({matcher})"), self.consistency(changed) / self.consistency(real), true));
         found
     }
 }
@@ -145,13 +148,14 @@ fn instruments() -> Option<(Instruments, Instant)> {
     let (height, width) = SIZE;
     let real = each(&pictures.instant(0).unwrap(), |picture| picture.resized(height, width, ResizeFilter::PilBicubic));
     let networks = NetworkFolder { folders: vec![weights], device: train::DeviceConfig::Flex.open().unwrap() };
-    let names = ["psnr/bev-vae", "ssim/skimage7", "ssim/gauss11", "ms_ssim/gauss11"];
+    let names = ["psnr/bev-vae", "ssim/skimage7", "ssim/gauss11", "ms_ssim/gauss11", "lpips/squeeze"];
     let known = Protocol::built_in().unwrap();
     let named = |name: &&str| known.iter().find(|protocol| protocol.name == **name).unwrap().clone();
     let set = named(&"fid/plain");
+    let scalar = |name: &&str| ScalarMetric::of(&named(name), 0, &networks).unwrap().unwrap();
+    let pairs = names.iter().map(scalar).collect();
     let network = networks.pictures(set.feature().unwrap()).unwrap();
-    let instruments =
-        Instruments { pairs: names.iter().map(named).collect(), network, matcher: networks.matcher().unwrap() };
+    let instruments = Instruments { pairs, network, matcher: networks.matcher().unwrap() };
     Some((instruments, real))
 }
 

@@ -2,8 +2,8 @@
 
     python tests/peers/metrics_peers.py RIGSCAPE WEIGHTS PHOTOS
 
-RIGSCAPE is the program, WEIGHTS a folder with vgg16_conv_f16.safetensors, PHOTOS a folder of photographs. Two folders of crops are
-written, the second one blurred and noisy. Feature distances use the same VGG-16 on both sides, because the official Inception weights
+RIGSCAPE is the program, WEIGHTS a folder with efficientnet_lite0_imagenet.safetensors, PHOTOS a folder of photographs. Two folders of crops are
+written, the second one blurred and noisy. Feature distances use the same EfficientNet-Lite0 on both sides, because the official Inception weights
 are on no package index; so the formulas, resizes and statistics are compared, not the network.
 """
 
@@ -15,9 +15,9 @@ import tempfile
 
 import numpy as np
 import torch
+from efficientnet_lite0 import EfficientNetLite0
 from PIL import Image, ImageFilter
 from pytorch_fid.fid_score import calculate_frechet_distance
-from safetensors.torch import load_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 from torchmetrics.image.fid import FrechetInceptionDistance
@@ -48,29 +48,18 @@ def read(folder):
     return [np.asarray(Image.open(os.path.join(folder, name))) for name in sorted(os.listdir(folder))]
 
 
-class Vgg(torch.nn.Module):
-    """Means of relu5_3 at 112x112, Pillow's bilinear resize, Caffe's input, as the stand-in of the program."""
+class Resized(torch.nn.Module):
+    """The stand-in of the program: Pillow's bicubic resize of bytes to 224x224, then EfficientNet-Lite0."""
 
-    num_features = 512
+    num_features = EfficientNetLite0.num_features
 
-    def __init__(self, path):
+    def __init__(self, weights):
         super().__init__()
-        self.weights = {name: tensor.float() for name, tensor in load_file(path).items()}
+        self.network = EfficientNetLite0(weights)
 
-    @torch.no_grad()
     def forward(self, pictures):
-        rows = []
-        for picture in pictures:
-            small = Image.fromarray(picture.permute(1, 2, 0).numpy()).resize((112, 112), Image.BILINEAR)
-            x = torch.from_numpy(np.asarray(small).copy()).permute(2, 0, 1)[None].float().flip(1)
-            x = x - torch.tensor([103.939, 116.779, 123.68])[None, :, None, None]
-            for block, convolutions in enumerate([2, 2, 3, 3, 3], 1):
-                if block > 1:
-                    x = torch.nn.functional.max_pool2d(x, 2)
-                for conv in range(1, convolutions + 1):
-                    name = f"block{block}_conv{conv}"
-                    x = torch.relu(torch.nn.functional.conv2d(x, self.weights[name + ".weight"], self.weights[name + ".bias"], padding=1))
-            rows.append(x.mean((2, 3)))
+        small = [Image.fromarray(picture.permute(1, 2, 0).numpy()).resize((224, 224), Image.BICUBIC) for picture in pictures]
+        rows = [self.network(torch.from_numpy(np.asarray(one).copy()).permute(2, 0, 1)[None].float() / 255) for one in small]
         return torch.cat(rows)
 
 
@@ -115,7 +104,7 @@ def features(weights, folder, real, generated, value):
     saved = [np.load(f"{folder}/{side}.npz") for side in ("generated", "real")]
     distance = calculate_frechet_distance(saved[0]["mu"], saved[0]["sigma"], saved[1]["mu"], saved[1]["sigma"])
     line("Frechet distance, pytorch-fid on our --save-stats .npz", value("fid/plain"), distance)
-    network = Vgg(os.path.join(weights, "vgg16_conv_f16.safetensors"))
+    network = Resized(weights)
     batch = lambda pictures: torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
     fid = FrechetInceptionDistance(feature=network, normalize=False, input_img_size=(3, 256, 256))
     fid.set_dtype(torch.float64)
@@ -124,8 +113,8 @@ def features(weights, folder, real, generated, value):
     for metric in (fid, kid):
         metric.update(batch(real), real=True)
         metric.update(batch(generated), real=False)
-    line("Frechet distance, torchmetrics with VGG-16 in PyTorch", value("fid/plain"), fid.compute().item())
-    line("KID of all samples, torchmetrics with VGG-16 in PyTorch", value("kid/plain"), kid.compute()[0].item())
+    line("Frechet distance, torchmetrics with the network in PyTorch", value("fid/plain"), fid.compute().item())
+    line("KID of all samples, torchmetrics with the network in PyTorch", value("kid/plain"), kid.compute()[0].item())
 
 
 if __name__ == "__main__":

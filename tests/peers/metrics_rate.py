@@ -2,11 +2,10 @@
 
     python tests/peers/metrics_rate.py FRAMES [WEIGHTS]
 
-With a folder of weights the distance looks through VGG-16 as in metrics_peers.py (the resize runs in PyTorch), else through the mean
+With a folder of weights the distance looks through EfficientNet-Lite0 as in metrics_peers.py (the resize runs in PyTorch), else through the mean
 colours of an 8x8 grid. The pictures are the same as in the bench; making them is not counted here.
 """
 
-import os
 import sys
 import time
 
@@ -30,22 +29,12 @@ def made(index, noise):
     return torch.from_numpy(np.stack(views)).permute(0, 3, 1, 2).contiguous()
 
 
-def vgg(weights):
-    from safetensors.torch import load_file
+def efficientnet(weights):
+    from efficientnet_lite0 import EfficientNetLite0
 
-    tensors = {name: tensor.float() for name, tensor in load_file(os.path.join(weights, "vgg16_conv_f16.safetensors")).items()}
-
-    def features(pictures):
-        x = torch.nn.functional.interpolate(pictures.float(), (112, 112), mode="bilinear", antialias=True).flip(1)
-        x = x - torch.tensor([103.939, 116.779, 123.68])[None, :, None, None]
-        for block, convolutions in enumerate([2, 2, 3, 3, 3], 1):
-            x = torch.nn.functional.max_pool2d(x, 2) if block > 1 else x
-            for conv in range(1, convolutions + 1):
-                name = f"block{block}_conv{conv}"
-                x = torch.relu(torch.nn.functional.conv2d(x, tensors[name + ".weight"], tensors[name + ".bias"], padding=1))
-        return x.mean((2, 3))
-
-    return features
+    network = EfficientNetLite0(weights)
+    resize = lambda x: torch.nn.functional.interpolate(x, (224, 224), mode="bicubic", antialias=True).clamp(0, 1)
+    return lambda pictures: network(resize(pictures.float() / 255))
 
 
 def grid(pictures):
@@ -55,7 +44,7 @@ def grid(pictures):
 @torch.no_grad()
 def main():
     frames = int(sys.argv[1])
-    features = vgg(sys.argv[2]) if len(sys.argv) > 2 else grid
+    features = efficientnet(sys.argv[2]) if len(sys.argv) > 2 else grid
     pairs = [(made(index, 0), made(index, 1)) for index in range(min(frames, 24))]
     seconds = {"PSNR": 0.0, "SSIM 11x11": 0.0, "features": 0.0, "distance": 0.0}
     rows = [[], []]

@@ -20,8 +20,8 @@ use self::sides::{Sides, model, painted, stored};
 use self::statistics::{replaced, save_statistics};
 use super::common::{DataArgs, LoadedModel, UsageError, say};
 use crate::evaluate::{
-    NetworkFolder, Pass, PassOptions, PictureSource, Report, ScalarMetric, Side, detection_markdown, detection_score,
-    draw_report, numbers, write_file,
+    NetworkFolder, Pass, PassOptions, PictureSource, Report, Side, detection_markdown, detection_score, draw_report,
+    needs_pairs, numbers, write_file,
 };
 use crate::sheet::save_picture;
 
@@ -200,10 +200,6 @@ fn chosen(args: &EvaluateArgs, known: &[Protocol], has_weights: bool) -> anyhow:
         )));
     }
     Ok(found)
-}
-
-fn needs_pairs(protocol: &Protocol) -> bool {
-    ScalarMetric::of(protocol, 0).is_some()
 }
 
 fn has_real(args: &EvaluateArgs) -> bool {

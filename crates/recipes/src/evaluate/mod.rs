@@ -20,12 +20,14 @@ use anyhow::Context;
 
 pub use chart::Curve;
 pub use detections::{detection_markdown, detection_score};
-pub use network::{Loaded, NetworkFolder, PictureNetwork, Pictures, SeamMatcher, WeightsUsed, network_input};
+pub use network::{
+    FeatureNetwork, Loaded, NetworkFolder, PairNetwork, Pictures, SeamMatcher, WeightsUsed, network_input,
+};
 pub use page::{draw_curves, draw_report};
 pub use painted::Painted;
 pub use pass::{Pass, PassOptions};
 pub use report::{MetricReport, Replaced, Report, STAND_IN, numbers};
-pub use scalar::{ScalarMetric, measure, prepared};
+pub use scalar::{ScalarMetric, measure, needs_pairs, prepared};
 pub use source::{DatasetPictures, Folder, Instant, PictureSource, Shot};
 pub use statistics_file::SavedStatistics;
 pub use streams::{ClipCutter, FeatureStream, SeamStream, Side, SideFeatures};

@@ -10,7 +10,7 @@ use metrics::{
 use rayon::prelude::*;
 
 use super::network::{NetworkFolder, network_input};
-use super::scalar::{ScalarMetric, measure, prepared};
+use super::scalar::{ScalarMetric, prepared};
 use super::source::{Instant, PictureSource, Shot};
 use super::streams::{FeatureStream, SeamStream, Side};
 
@@ -82,7 +82,7 @@ impl Pass {
     }
 
     fn open(&mut self, protocol: &Protocol, options: &PassOptions, networks: &NetworkFolder) -> anyhow::Result<()> {
-        if let Some(scalar) = ScalarMetric::of(protocol, options.worst) {
+        if let Some(scalar) = ScalarMetric::of(protocol, options.worst, networks)? {
             self.scalars.push(scalar);
             return Ok(());
         }
@@ -92,12 +92,11 @@ impl Pass {
                     self.seams = Some(SeamStream::new(networks.matcher()?));
                 }
             }
-            MetricChoice::Lpips { network } => bail!("LPIPS on {network} is not there yet; choose other protocols"),
             _ if self.stream_of(protocol).is_some() => {}
             metric => {
                 let Some(feature) = protocol.feature() else { return Ok(()) };
                 let clip = if let MetricChoice::Fvd { clip, .. } = metric { Some(*clip) } else { None };
-                let loaded = networks.pictures(feature)?;
+                let loaded = if clip.is_some() { networks.clips(feature)? } else { networks.pictures(feature)? };
                 self.streams.push(FeatureStream::new(protocol, loaded, clip, options.batch, options.seed));
             }
         }
@@ -200,7 +199,7 @@ impl Pass {
                 other.with_context(|| format!("{}: the real side has no camera {}", real.name, shot.channel))?;
             for (at, scalar) in self.scalars.iter().enumerate() {
                 let place = || format!("{} {}", generated.name, shot.channel);
-                let value = measure(&scalar.protocol, &other.picture, &shot.picture).with_context(place)?;
+                let value = scalar.measure(&other.picture, &shot.picture).with_context(place)?;
                 values.push((at, shot.channel.clone(), value));
             }
         }

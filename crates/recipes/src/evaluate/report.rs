@@ -101,6 +101,9 @@ pub fn numbers(
                 let scalar = pass.scalars.iter().find(|scalar| scalar.protocol == *protocol);
                 if let Some(scalar) = scalar {
                     let mut report = start(protocol, scalar.mean.count() + scalar.identical);
+                    if let Some(loaded) = &scalar.network {
+                        report = report.looked_through(&loaded.weights, loaded.stand_in.as_ref());
+                    }
                     (report.value, report.deviation) = (scalar.mean.mean(), scalar.mean.deviation());
                     if scalar.identical > 0 {
                         let identical = scalar.identical;
@@ -157,7 +160,12 @@ impl MetricReport {
     fn looked_through(mut self, weights: &WeightsUsed, stand_in: Option<&String>) -> Self {
         self.weights = Some(weights.clone());
         if let Some(network) = stand_in {
-            self.name = format!("{}-{network}", self.name);
+            self.name = match self.settings.metric {
+                MetricChoice::Fvd { .. } => format!("fvd-frames-{network}"),
+                MetricChoice::Mvsc | MetricChoice::Vms => format!("{}_proxy({network})", self.name),
+                MetricChoice::Lpips { .. } => format!("perceptual_distance({network})"),
+                _ => format!("{}-{network}", self.name),
+            };
             self.is_proxy = true;
             self.notes.push(STAND_IN.to_owned());
         }
@@ -199,9 +207,6 @@ fn of_stream(
     let report = start(protocol, generated.moments.count() as u64);
     let mut report = report.looked_through(&stream.loaded.weights, stream.loaded.stand_in.as_ref());
     report.real_samples = Some(real.moments.count() as u64);
-    if stream.clip.is_some() && report.is_proxy {
-        report.name = report.name.replacen("fvd-", "fvd-frames-", 1);
-    }
     match &protocol.metric {
         MetricChoice::Kid { subsets, .. } => {
             let subsets = KidSubsets { seed: subsets.seed.wrapping_add(seed), ..*subsets };

@@ -5,16 +5,19 @@ use metrics::{
     Histogram, ImageSize, Mean, MetricChoice, PictureStep, Protocol, Raster, Worst, image_mse, ms_ssim, psnr_db, ssim,
 };
 
+use super::network::{Loaded, NetworkFolder, PairNetwork, Pictures};
+
 /// Bins of the histograms.
 const BINS: usize = 60;
 /// dB; beyond it two pictures of 8 bits cannot differ.
 const MOST_DB: f64 = 60.0;
 
 /// Collects one metric over all pairs.
-#[derive(Debug, Clone)]
 pub struct ScalarMetric {
     /// How it is computed.
     pub protocol: Protocol,
+    /// What LPIPS looks through.
+    pub network: Option<Loaded<dyn PairNetwork>>,
     /// Over pictures; those equal to their counterpart are left out of PSNR.
     pub mean: Mean,
     /// Equal pairs of PSNR.
@@ -27,19 +30,37 @@ pub struct ScalarMetric {
 
 impl ScalarMetric {
     /// `None` for a metric that is no number per pair.
-    pub fn of(protocol: &Protocol, keep_worst: usize) -> Option<Self> {
-        let range = match protocol.metric {
-            MetricChoice::Psnr => (0.0, MOST_DB),
-            MetricChoice::Ssim { .. } | MetricChoice::MsSsim => (0.0, 1.0),
-            _ => return None,
+    ///
+    /// # Errors
+    /// Missing or wrong weights of LPIPS.
+    pub fn of(protocol: &Protocol, keep_worst: usize, networks: &NetworkFolder) -> anyhow::Result<Option<Self>> {
+        let Some((range, higher_is_better)) = pair_range(&protocol.metric) else { return Ok(None) };
+        let network = match &protocol.metric {
+            MetricChoice::Lpips { network } => Some(networks.pairs(network)?),
+            _ => None,
         };
-        Some(Self {
+        Ok(Some(Self {
             protocol: protocol.clone(),
+            network,
             mean: Mean::default(),
             identical: 0,
             histogram: Histogram::new(range.0, range.1, BINS),
-            worst: Worst::new(keep_worst, true),
-        })
+            worst: Worst::new(keep_worst, higher_is_better),
+        }))
+    }
+
+    /// The value of one pair.
+    ///
+    /// # Errors
+    /// As [`measure`].
+    pub fn measure(&self, real: &Raster<u8>, generated: &Raster<u8>) -> anyhow::Result<f64> {
+        let Some(loaded) = &self.network else { return measure(&self.protocol, real, generated) };
+        let (real, generated) = same_size(&self.protocol, real, generated)?;
+        let unit = |raster: &Raster<u8>| raster.map(|value| f32::from(value) / 255.0).planes();
+        let (height, width) = (real.height, real.width);
+        let (real, generated) = (unit(&real), unit(&generated));
+        let pictures = |values| Pictures { count: 1, height, width, values };
+        loaded.network.distance(pictures(&real), pictures(&generated))
     }
 
     /// Takes the value of a pair in.
@@ -66,11 +87,27 @@ pub fn prepared(picture: &Raster<u8>, steps: &[PictureStep]) -> anyhow::Result<R
     })
 }
 
-/// The value of one pair.
-///
-/// # Errors
-/// Pictures of different sizes, or too small for the metric.
-pub fn measure(protocol: &Protocol, real: &Raster<u8>, generated: &Raster<u8>) -> anyhow::Result<f64> {
+/// Ends of the histogram and whether higher is better; `None` for a metric that is no number per pair.
+fn pair_range(metric: &MetricChoice) -> Option<((f64, f64), bool)> {
+    match metric {
+        MetricChoice::Psnr => Some(((0.0, MOST_DB), true)),
+        MetricChoice::Ssim { .. } | MetricChoice::MsSsim => Some(((0.0, 1.0), true)),
+        MetricChoice::Lpips { .. } => Some(((0.0, 1.0), false)),
+        _ => None,
+    }
+}
+
+/// Whether a protocol compares pairs of pictures.
+pub fn needs_pairs(protocol: &Protocol) -> bool {
+    pair_range(&protocol.metric).is_some()
+}
+
+/// Both pictures after the protocol's steps.
+fn same_size(
+    protocol: &Protocol,
+    real: &Raster<u8>,
+    generated: &Raster<u8>,
+) -> anyhow::Result<(Raster<u8>, Raster<u8>)> {
     let (real, generated) = (prepared(real, &protocol.real)?, prepared(generated, &protocol.generated)?);
     if (real.height, real.width) != (generated.height, generated.width) {
         bail!(
@@ -81,6 +118,15 @@ pub fn measure(protocol: &Protocol, real: &Raster<u8>, generated: &Raster<u8>) -
             generated.width
         );
     }
+    Ok((real, generated))
+}
+
+/// The value of one pair for a metric without a network.
+///
+/// # Errors
+/// Pictures of different sizes, or too small for the metric.
+pub fn measure(protocol: &Protocol, real: &Raster<u8>, generated: &Raster<u8>) -> anyhow::Result<f64> {
+    let (real, generated) = same_size(protocol, real, generated)?;
     let size = ImageSize { channels: 3, height: real.height, width: real.width };
     let (target, prediction) = (real.planes(), generated.planes());
     match protocol.metric {
@@ -93,6 +139,6 @@ pub fn measure(protocol: &Protocol, real: &Raster<u8>, generated: &Raster<u8>) -
             Ok(ssim(&prediction, &target, size, window))
         }
         MetricChoice::MsSsim => Ok(ms_ssim(&prediction, &target, size)?),
-        _ => bail!("{} is no metric of pairs", protocol.name),
+        _ => bail!("{} is no metric of pairs without a network", protocol.name),
     }
 }

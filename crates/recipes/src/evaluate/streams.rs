@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use metrics::{ClipRule, FeaturePool, Moments, Protocol, Seam, ViewConsistency};
 
-use super::network::{Loaded, PictureNetwork, Pictures, SeamMatcher, WeightsUsed};
+use super::network::{FeatureNetwork, Loaded, Pictures, SeamMatcher, WeightsUsed};
 
 /// Which of the two sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -46,7 +46,7 @@ pub struct FeatureStream {
     /// The protocols it serves differ from this one in the metric only.
     pub protocol: Protocol,
     /// The network.
-    pub loaded: Loaded<dyn PictureNetwork>,
+    pub loaded: Loaded<dyn FeatureNetwork>,
     /// How clips are cut; `None` for single pictures.
     pub clip: Option<ClipRule>,
     real: SideFeatures,
@@ -60,12 +60,12 @@ impl FeatureStream {
     /// `batch` pictures go through the network at once.
     pub fn new(
         protocol: &Protocol,
-        loaded: Loaded<dyn PictureNetwork>,
+        loaded: Loaded<dyn FeatureNetwork>,
         clip: Option<ClipRule>,
         batch: usize,
         seed: u64,
     ) -> Self {
-        let width = if clip.is_some() { 2 * loaded.network.width() } else { loaded.network.width() };
+        let width = loaded.network.width();
         Self {
             protocol: protocol.clone(),
             loaded,
@@ -104,7 +104,7 @@ impl FeatureStream {
         };
         let cutter = self.cutters.entry((side, channel.to_owned())).or_insert_with(|| ClipCutter::new(rule));
         let Some(frames) = cutter.add(input) else { return Ok(()) };
-        let row = self.clip_row(&frames)?;
+        let row = self.rows(frames.len(), &frames.concat())?;
         let width = row.len();
         self.side_mut(side).add(&[name], &row, width)
     }
@@ -136,21 +136,6 @@ impl FeatureStream {
     fn rows(&self, count: usize, values: &[f32]) -> anyhow::Result<Vec<f32>> {
         let [height, width] = self.loaded.network.feature().size;
         self.loaded.network.features(Pictures { count, height, width, values })
-    }
-
-    /// A stand-in for a network of clips: mean of the frames' features, and mean of their changes from frame to frame.
-    fn clip_row(&self, frames: &[Vec<f32>]) -> anyhow::Result<Vec<f32>> {
-        let (width, count) = (self.loaded.network.width(), frames.len().max(1));
-        let rows = self.rows(frames.len(), &frames.concat())?;
-        let rows: Vec<&[f32]> = rows.chunks_exact(width.max(1)).collect();
-        let mean = |values: &dyn Fn(usize) -> f64, count: usize| (values(count) / count.max(1) as f64) as f32;
-        let level = (0..width)
-            .map(|d| mean(&|_| rows.iter().filter_map(|row| row.get(d)).map(|value| f64::from(*value)).sum(), count));
-        let change = (0..width).map(|d| {
-            let steps = rows.windows(2).filter_map(|pair| Some((pair.first()?.get(d)?, pair.last()?.get(d)?)));
-            mean(&|_| steps.clone().map(|(a, b)| f64::from(b - a).abs()).sum(), count - 1)
-        });
-        Ok(level.chain(change).collect())
     }
 }
 
