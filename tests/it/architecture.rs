@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The only arrows allowed, as in crates/README.md. `recipes` is the root package.
-const ARROWS: [(&str, &[&str]); 13] = [
+const ARROWS: [(&str, &[&str]); 14] = [
     ("pickle", &[]),
     ("geometry", &[]),
     ("world", &["geometry"]),
@@ -16,6 +16,7 @@ const ARROWS: [(&str, &[&str]); 13] = [
     ("features", &["ops", "nn"]),
     ("vae", &["geometry", "nn", "features", "ops"]),
     ("stable-diffusion", &["nn", "ops"]),
+    ("dit", &["nn", "ops"]),
     ("metrics", &["features"]),
     ("train", &[]),
     (

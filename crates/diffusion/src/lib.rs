@@ -6,6 +6,7 @@
 //! Letters as in Song et al., "Score-Based Generative Modeling through SDEs", and Lu et al., "DPM-Solver++": `x = α·x0 + σ·noise`,
 //! λ = ln(α/σ).
 
+mod bound;
 mod flow;
 mod guidance;
 mod samplers;
@@ -13,6 +14,7 @@ mod schedule;
 mod target;
 mod timesteps;
 
+pub use bound::variance_bound;
 pub use flow::{flow_noised, flow_sigmas, flow_velocity};
 pub use guidance::{guide, rescale_guidance};
 pub use samplers::{

@@ -13,6 +13,8 @@ pub enum Spacing {
     },
     /// Even from T − 1 down to 0, both included; multistep solvers leave 0 out.
     Linspace,
+    /// As [`Spacing::Linspace`], rounded to whole timesteps, halves to the even one (DiT's code).
+    Rounded,
     /// Even from T − 1 down, so that the noisiest timestep is always visited.
     Trailing,
     /// Integer parts of an even line from T − 1 down to 0, 0 excluded (Panacea's code).
@@ -28,6 +30,7 @@ impl Spacing {
             Self::Leading { offset } => ascending(&|i| i * (total / steps) as f64 + offset as f64),
             Self::Linspace if steps == 1 => vec![0.0],
             Self::Linspace => ascending(&|i| i * last / (steps - 1) as f64),
+            Self::Rounded => Self::Linspace.visits(steps, total).into_iter().map(f64::round_ties_even).collect(),
             Self::Trailing => trailing(steps, total),
             Self::FlooredLinspace => (0..steps).map(|i| (last - i as f64 * last / steps as f64).floor()).collect(),
         }
@@ -40,7 +43,9 @@ impl Spacing {
             Self::Leading { offset } => {
                 (1..=steps).rev().map(|i| (i * (total / (steps + 1)) + offset) as f64).collect()
             }
-            Self::Linspace => (1..=steps).rev().map(|i| (i as f64 * last / steps as f64).round_ties_even()).collect(),
+            Self::Linspace | Self::Rounded => {
+                (1..=steps).rev().map(|i| (i as f64 * last / steps as f64).round_ties_even()).collect()
+            }
             Self::Trailing | Self::FlooredLinspace => self.visits(steps, total),
         }
     }

@@ -24,7 +24,7 @@ mod sampling;
 mod softmax;
 mod sums;
 
-pub use activation::{gelu, silu};
+pub use activation::{gelu, gelu_tanh, silu};
 pub use attention::{attention, rotary_attention};
 pub use conv::{conv2d, conv3d};
 pub use fused::composed_only;

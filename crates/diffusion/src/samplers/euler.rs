@@ -37,7 +37,7 @@ impl Euler {
     pub fn start_scale(&self, schedule: &NoiseSchedule) -> f64 {
         let first = self.sigmas(schedule)[0];
         match self.spacing {
-            Spacing::Linspace | Spacing::Trailing => first,
+            Spacing::Linspace | Spacing::Rounded | Spacing::Trailing => first,
             Spacing::Leading { .. } | Spacing::FlooredLinspace => (first * first + 1.0).sqrt(),
         }
     }

@@ -57,7 +57,7 @@ impl Probe {
     }
 
     fn elementwise_and_norms(&mut self) {
-        for function in [ops::gelu, ops::silu, ops::softmax] {
+        for function in [ops::gelu, ops::gelu_tanh, ops::silu, ops::softmax] {
             let (leaf, x) = self.leaf([3, 5, 24], 0.0);
             self.record("activation", &[&leaf], function(x * 4.0));
         }

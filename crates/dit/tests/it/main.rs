@@ -1,0 +1,5 @@
+//! The transformer against stored numbers, and how it behaves.
+
+mod behaviour;
+mod golden;
+mod official;
