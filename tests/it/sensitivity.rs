@@ -159,10 +159,13 @@ fn instruments() -> Option<(Instruments, Instant)> {
     Some((instruments, real))
 }
 
+/// Damages a moment's pictures by so much.
+type Damage<'a> = &'a dyn Fn(&Instant, f64) -> Instant;
+
 #[test]
 fn every_metric_worsens_with_growing_damage() {
     let Some((instruments, real)) = instruments() else { return };
-    let damages: [(&str, &[f64], &dyn Fn(&Instant, f64) -> Instant); 4] = [
+    let damages: [(&str, &[f64], Damage<'_>); 4] = [
         ("blur, deviation in px", &[0.5, 1.0, 2.0, 4.0], &|real, level| each(real, |picture| blurred(picture, level))),
         ("noise, amplitude of 255", &[6.0, 12.0, 24.0, 48.0], &|real, level| {
             each(real, |picture| noisy(picture, level))

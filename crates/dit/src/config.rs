@@ -129,17 +129,17 @@ impl DitConfig {
         if self.latent_size.iter().any(|size| size % self.patch != 0) {
             return refuse(format!("patch {} must divide the latent's {:?} cells", self.patch, self.latent_size));
         }
-        if self.width % self.heads != 0 {
+        if !self.width.is_multiple_of(self.heads) {
             return refuse(format!("{} heads must divide the width {}", self.heads, self.width));
         }
-        if self.width % 4 != 0 {
+        if !self.width.is_multiple_of(4) {
             return refuse(format!("the position code needs a width divisible by 4, not {}", self.width));
         }
         match self.condition {
             ConditionConfig::Layout { classes, slices, patch } if classes == 0 || slices == 0 || patch == 0 => {
                 refuse("a layout needs classes, slices and a patch from 1".to_owned())
             }
-            ConditionConfig::Layout { slices, .. } if self.width % slices != 0 => {
+            ConditionConfig::Layout { slices, .. } if !self.width.is_multiple_of(slices) => {
                 refuse(format!("{slices} height slices of the layout must divide the width {}", self.width))
             }
             ConditionConfig::Labels { classes: 0 } => refuse("labels need at least one class".to_owned()),

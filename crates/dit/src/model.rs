@@ -11,6 +11,7 @@ use crate::embedding::{TimestepEmbedding, position_code};
 
 /// What a batch is steered by.
 #[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant)] // One per forward pass.
 pub enum Condition<'a> {
     /// Boxes as occupancy, for a network with [`ConditionConfig::Layout`].
     Layout {

@@ -39,7 +39,7 @@ pub fn gelu_tanh<const R: usize>(x: Tensor<R>) -> Tensor<R> {
 /// Coefficient of the cube in [`gelu_tanh`].
 const CUBIC: f32 = 0.044_715;
 /// 2·√(2/π): `(1 + tanh(u)) / 2` is `sigmoid(2u)`.
-const TWICE_SLOPE: f32 = 1.595_769_1;
+const TWICE_SLOPE: f32 = 1.595_769;
 
 /// SiLU, `x · sigmoid(x)`, elementwise.
 ///

@@ -19,7 +19,7 @@ fn network(io: &Golden) -> Inception {
 
 fn means(map: Tensor<4>) -> Tensor<2> {
     let [images, channels, height, width] = map.dims();
-    map.reshape([images, channels, height * width]).mean_dim(2).reshape([images, channels])
+    ops::mean_dim(map.reshape([images, channels, height * width]), 2).reshape([images, channels])
 }
 
 #[test]

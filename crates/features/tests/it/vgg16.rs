@@ -35,8 +35,8 @@ fn picture(io: &Golden, name: &str, device: &Device) -> Tensor<4> {
 
 /// Per tap: unit-normalise over channels, squared difference, sum over channels, mean over pixels.
 fn unit_loss(wanted: Vec<Tensor<4>>, found: Vec<Tensor<4>>) -> Tensor<1> {
-    let unit = |f: Tensor<4>| f.clone() / (f.square().sum_dim(1).sqrt() + 1e-10);
-    let per_tap = wanted.into_iter().zip(found).map(|(w, f)| (unit(w) - unit(f)).square().sum_dim(1).mean());
+    let unit = |f: Tensor<4>| f.clone() / (ops::sum_dim(f.square(), 1).sqrt() + 1e-10);
+    let per_tap = wanted.into_iter().zip(found).map(|(w, f)| ops::sum_dim((unit(w) - unit(f)).square(), 1).mean());
     per_tap.reduce(|sum, tap| sum + tap).unwrap()
 }
 

@@ -31,7 +31,7 @@ impl Report {
                 .to_owned(),
         );
         for one in &self.metrics {
-            let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| rounded(value));
+            let number = |value: Option<f64>| value.map_or("-".to_owned(), rounded);
             let unit = if one.unit == "1" { String::new() } else { format!(" {}", one.unit) };
             let weights = one.weights.as_ref().map_or("-".to_owned(), |weights| {
                 format!("{} {}", weights.file, weights.sha256.get(..12).unwrap_or_default())
