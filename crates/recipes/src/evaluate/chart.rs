@@ -9,7 +9,16 @@ pub(super) const INK: Color = [30, 30, 34];
 const FAINT: Color = [200, 200, 206];
 const BARS: Color = [86, 130, 190];
 /// Told apart without red against green.
-const CURVES: [Color; 6] = [[0, 90, 181], [220, 50, 32], [93, 58, 155], [230, 159, 0], [0, 158, 115], [90, 90, 90]];
+const CURVES: [Color; 8] = [
+    [0, 90, 181],
+    [220, 50, 32],
+    [93, 58, 155],
+    [230, 159, 0],
+    [0, 158, 115],
+    [90, 90, 90],
+    [86, 180, 233],
+    [204, 121, 167],
+];
 
 /// A rectangle of the page.
 #[derive(Debug, Clone, Copy)]
