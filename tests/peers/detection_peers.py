@@ -74,9 +74,11 @@ def main():
                 rows.append((f"{error} {name}", one["errors"][at], peer["label_tp_errors"][name][error]))
     for what, mine, theirs in rows:
         print(f"{what:<36} {mine:>18.12f} {theirs:>18.12f} {abs(mine - theirs):>9.1e}")
-    worst = max(abs(mine - theirs) for _, mine, theirs in rows)
-    print(f"largest difference {worst:.1e} of {len(rows)} numbers")
-    if not worst < 1e-9:
+    # The devkit subtracts time stamps in seconds as doubles, which rounds them to 0.2 us; the program subtracts integers.
+    timed = [abs(mine - theirs) for what, mine, theirs in rows if "vel_err" in what or what == "NDS"]
+    exact = [abs(mine - theirs) for what, mine, theirs in rows if not ("vel_err" in what or what == "NDS")]
+    print(f"largest difference {max(exact):.1e} of {len(exact)} numbers; {max(timed):.1e} of {len(timed)} that depend on velocities")
+    if not (max(exact) < 1e-9 and max(timed) < 1e-5):
         sys.exit("the numbers differ")
 
 
