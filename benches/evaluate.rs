@@ -113,6 +113,7 @@ fn main() -> anyhow::Result<()> {
     let mut pass = Pass::new(&options(&["psnr/bev-vae", "ssim/gauss11", "fid/plain"]), &networks)?;
     let clock = Clock::now();
     pass.paired(&Made { frames, noise: 0 }, &Made { frames, noise: 1 })?;
+    println!("  after {frames:>5} frames {:>8.1} MB resident", resident_mb().unwrap_or(f64::NAN));
     for stream in &pass.streams {
         let [real, generated] =
             [Side::Real, Side::Generated].map(|side| stream.side(side).moments.statistics("a side"));

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::programs::rigscape;
-use crate::runs::must;
+use crate::programs::{data, rigscape};
+use crate::runs::{must, train, write_config};
 
 /// Weights for networks, when there are any.
 pub fn weights() -> Option<PathBuf> {
@@ -194,4 +194,32 @@ fn a_dataset_against_itself_has_consistent_views() {
     assert!(mvsc["notes"].to_string().contains("24 pairs of views"), "{mvsc}");
     let same = mvsc["value"].is_null() || mvsc["value"].as_f64() == Some(1.0);
     assert!(same, "equal sides: {mvsc}");
+}
+
+#[test]
+fn a_checkpoint_is_measured_against_what_it_was_shown() {
+    let folder = tempfile::tempdir().unwrap();
+    must(train(&write_config(folder.path()), &["--set", "train.steps=2"]));
+    let (run, out) = (text(&folder.path().join("runs/run")), folder.path().join("out"));
+    let args = ["evaluate", "--checkpoint", &run, "--protocol", "psnr/bev-vae,ssim/gauss11", "--out", &text(&out)];
+    must(rigscape(&args));
+    let found = report(&out);
+    assert_eq!((found["frames"].as_u64(), found["pictures"].as_u64()), (Some(2), Some(12)));
+    assert!(metric(&found, "psnr")["value"].as_f64().unwrap() > 3.0);
+    assert!(found["model"]["checkpoint"].as_str().unwrap().contains("runs/run"), "{found}");
+}
+
+#[test]
+fn detections_must_hold_every_sample_of_the_split() {
+    let Some(root) = data("nuscenes_chain") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("detections.json");
+    let meta = "{\"use_camera\":true,\"use_lidar\":false,\"use_radar\":false,\"use_map\":false,\"use_external\":false}";
+    std::fs::write(&path, format!("{{\"meta\":{meta},\"results\":{{}}}}")).unwrap();
+    let (path, root) = (text(&path), text(&root));
+    let args =
+        ["evaluate", "--detections", &path, "--nuscenes", &root, "--version", "v1.0-mini", "--split", "mini_val"];
+    let missing = refusal(&args);
+    assert!(missing.contains("has no sample"), "{missing}");
+    assert!(refusal(&args[..3]).contains("--nuscenes"));
 }

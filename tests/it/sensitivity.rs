@@ -122,6 +122,7 @@ impl Instruments {
         for scalar in &self.pairs {
             let views = real.views.iter().zip(&changed.views);
             let values = views.map(|(real, changed)| scalar.measure(&real.picture, &changed.picture).unwrap());
+            // Equal views have an infinite PSNR.
             let mean = values.map(|value| value.min(100.0)).sum::<f64>() / real.views.len() as f64;
             let stand_in = scalar.network.as_ref().and_then(|loaded| loaded.stand_in.clone());
             let name =

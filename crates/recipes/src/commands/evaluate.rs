@@ -265,8 +265,9 @@ fn describe_file(path: Option<&Path>) -> String {
     path.map_or_else(String::new, |path| format!("statistics {}", path.display()))
 }
 
+/// Version and commit of the checkout the program was built from, wherever it is called.
 fn code_version() -> String {
-    let commit = head_commit(Path::new(".")).unwrap_or_else(|| "unknown".to_owned());
+    let commit = head_commit(Path::new(env!("CARGO_MANIFEST_DIR"))).unwrap_or_else(|| "unknown".to_owned());
     format!("rigscape {} commit {commit}", env!("CARGO_PKG_VERSION"))
 }
 

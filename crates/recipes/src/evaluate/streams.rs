@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use metrics::{ClipRule, FeaturePool, Moments, Protocol, Seam, ViewConsistency};
+use rayon::prelude::*;
 
 use super::network::{FeatureNetwork, Loaded, Pictures, SeamMatcher, WeightsUsed};
 
@@ -133,9 +134,17 @@ impl FeatureStream {
         self.side_mut(side).add(&names, &rows, width)
     }
 
+    /// A part of the batch per thread: small networks keep cores busier side by side than inside one pass.
     fn rows(&self, count: usize, values: &[f32]) -> anyhow::Result<Vec<f32>> {
         let [height, width] = self.loaded.network.feature().size;
-        self.loaded.network.features(Pictures { count, height, width, values })
+        let pictures = |count, values| self.loaded.network.features(Pictures { count, height, width, values });
+        if self.clip.is_some() {
+            return pictures(count, values);
+        }
+        let picture = 3 * height * width;
+        let share = count.div_ceil(rayon::current_num_threads().max(1)).max(1);
+        let parts = values.par_chunks(share * picture).map(|part| pictures(part.len() / picture, part));
+        Ok(parts.collect::<anyhow::Result<Vec<Vec<f32>>>>()?.concat())
     }
 }
 
