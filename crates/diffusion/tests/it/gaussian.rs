@@ -2,11 +2,13 @@
 
 use std::ops::ControlFlow;
 
-use burn::tensor::{Device, Distribution, Tensor};
+use burn::tensor::{Device, Tensor, TensorData};
 use diffusion::{
     Cancelled, Ddim, Ddpm, DpmSolver, Euler, FinalLevel, FlowEuler, NoiseSchedule, Oracle, SamplerConfig,
     ScheduleConfig, SolverVariant, Spacing, Target, UniPc, Variance,
 };
+use rand::{SeedableRng, rngs::StdRng};
+use rand_distr::{Distribution, StandardNormal};
 
 const MEAN: f64 = 0.7;
 const DEVIATION: f64 = 0.3;
@@ -49,6 +51,11 @@ fn samplers(steps: usize) -> Vec<SamplerConfig> {
     ]
 }
 
+fn normal(rng: &mut StdRng, shape: [usize; 2], device: &Device) -> Tensor<2> {
+    let values: Vec<f32> = StandardNormal.sample_iter(rng).take(shape[0] * shape[1]).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
 fn run(config: &SamplerConfig, start: Tensor<2>, stop_after: usize) -> Result<Tensor<2>, Cancelled> {
     let schedule = NoiseSchedule::new(&ScheduleConfig::STABLE_DIFFUSION).unwrap();
     config.checked(&schedule, Target::Noise).unwrap();
@@ -57,7 +64,8 @@ fn run(config: &SamplerConfig, start: Tensor<2>, stop_after: usize) -> Result<Te
         SamplerConfig::FlowEuler(_) => exact_velocity(x, t / 1000.0),
         _ => exact_noise(&schedule, x, t),
     };
-    let mut noise = || Tensor::random(shape, Distribution::Normal(0.0, 1.0), &device);
+    let mut rng = StdRng::seed_from_u64(2);
+    let mut noise = || normal(&mut rng, shape, &device);
     let mut watch = |report: diffusion::StepReport<'_, 2>| {
         if report.done == stop_after { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
@@ -68,13 +76,18 @@ fn run(config: &SamplerConfig, start: Tensor<2>, stop_after: usize) -> Result<Te
 #[test]
 fn every_sampler_finds_the_distribution() {
     let device = Device::flex();
+    let mut rng = StdRng::seed_from_u64(1);
+    // The schedule ends with some signal left: its last level of these data is not standard noise, whose runs end 0.014 off.
+    let alpha = NoiseSchedule::new(&ScheduleConfig::STABLE_DIFFUSION).unwrap().level(999).cumulative().sqrt();
+    let width = (1.0 - alpha * alpha * (1.0 - DEVIATION * DEVIATION)).sqrt();
     // Ancestral sampling with the small variance comes out 9 % too narrow in 100 steps, in inverse proportion to their number.
     for config in samplers(250) {
-        let start = Tensor::random([100, 200], Distribution::Normal(0.0, 1.0), &device);
+        let noise = normal(&mut rng, [100, 200], &device);
+        let start = if matches!(config, SamplerConfig::FlowEuler(_)) { noise } else { noise * width + alpha * MEAN };
         let end = run(&config, start, usize::MAX).unwrap();
         let mean = end.clone().mean().into_scalar::<f32>();
         let deviation = end.reshape([20_000]).var(0).sqrt().into_scalar::<f32>();
-        assert!((f64::from(mean) - MEAN).abs() < 0.02, "{config:?}: mean {mean}");
+        assert!((f64::from(mean) - MEAN).abs() < 0.01, "{config:?}: mean {mean}");
         assert!((f64::from(deviation) - DEVIATION).abs() < 0.02, "{config:?}: deviation {deviation}");
     }
 }
