@@ -1,6 +1,7 @@
 //! Every shipped experiment file is read strictly, and the small ones say what they promise.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use clap::Parser;
 use rigscape::autoencoder::AutoencoderExperiment;
@@ -46,6 +47,16 @@ fn shipped_configs_are_read_strictly_and_stay_short() {
             _ => read_back::<Experiment>(&path, Ok),
         }
     }
+}
+
+#[test]
+fn an_experiment_with_its_defaults_is_printed_as_a_config() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/toy/vae.toml");
+    let told = Command::new(env!("CARGO_BIN_EXE_train-vae")).arg("--config").arg(&path).arg("--print-config").output();
+    let told = String::from_utf8(told.unwrap().stdout).unwrap();
+    let experiment: Experiment = config_file::parse(&told, &[]).unwrap_or_else(|error| panic!("{error:#}\n{told}"));
+    assert_eq!(experiment, config_file::load(&path, &[]).unwrap());
+    assert!(told.contains("betas") && !std::fs::read_to_string(&path).unwrap().contains("betas"), "{told}");
 }
 
 /// What a run writes into its folder must read back as the same experiment.

@@ -222,4 +222,8 @@ fn detections_must_hold_every_sample_of_the_split() {
     let missing = refusal(&args);
     assert!(missing.contains("has no sample"), "{missing}");
     assert!(refusal(&args[..3]).contains("--nuscenes"));
+    let fvd = refusal(&["evaluate", "--wcoda-fvd", "200"]);
+    assert!(fvd.contains("--detections") && fvd.contains("--segmentation"), "{fvd}");
+    let alone = refusal(&["evaluate", "--segmentation", &text(folder.path())]);
+    assert!(alone.contains("--nuscenes DIR or --data FILE"), "{alone}");
 }

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use serde_json::Value;
 
 use crate::programs::rigscape;
-use crate::runs::{assert_equal_parts, find_number, must};
+use crate::runs::{assert_equal_parts, checkpoint, find_number, must, tensors};
 
 const COMMON: &str = r#"
 seed = 3
@@ -108,6 +108,34 @@ fn summary(run: &Path) -> Value {
     serde_json::from_str(&std::fs::read_to_string(run.join("summary.json")).unwrap()).unwrap()
 }
 
+/// Adapters on a finished run: only their factors are kept, they continue bit for bit, and they paint.
+fn check_adapters(config: &Path, base: &Path) {
+    let start = format!("init_from={:?}", base.to_string_lossy());
+    let adapted = |name: &str, extra: &[&str]| {
+        let name = format!("run.name={name}");
+        let settings = ["--set", &start, "--set", "adapter.rank=2", "--set", "checkpointing=true", "--set", &name];
+        must(unet(config, &[&settings[..], extra].concat()))
+    };
+    let told = adapted("lora", &[]);
+    adapted("lora-broken", &["--stop-after", "5"]);
+    adapted("lora-broken", &["--resume"]);
+    let folder = |name: &str| base.with_file_name(name);
+    assert_equal_parts(&folder("lora"), &folder("lora-broken"), &["model", "ema", "optimizer"]);
+    for (file, bytes) in checkpoint(&folder("lora")).iter().filter(|(file, _)| file.ends_with(".safetensors")) {
+        let kept = tensors(bytes);
+        assert!(!kept.is_empty() && kept.iter().all(|(name, _)| name.contains(".lora.stack.")), "{file}");
+    }
+    let written = folder("lora").join("lora/pytorch_lora_weights.safetensors");
+    assert!(written.is_file() && told.contains("lora") && !folder("lora").join("pipeline").exists());
+    let (run, out) = (folder("lora"), folder("lora").join("sample.png"));
+    let text = |path: &Path| path.to_string_lossy().into_owned();
+    must(rigscape(&["sample", "--checkpoint", &text(&run), "--out", &text(&out), "--caption", "a rainy night"]));
+    let refused = |extra: &[&str]| String::from_utf8(unet(config, extra).stderr).unwrap();
+    assert!(refused(&["--set", "adapter.rank=2", "--set", "run.name=x"]).contains("init_from"));
+    let on_adapters = format!("init_from={:?}", text(&run));
+    assert!(refused(&["--set", &on_adapters, "--set", "run.name=x"]).contains("adapters only"));
+}
+
 #[test]
 fn an_autoencoder_and_a_unet_on_it_are_trained_stopped_and_resumed() {
     let (whole, broken) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
@@ -142,6 +170,12 @@ fn an_autoencoder_and_a_unet_on_it_are_trained_stopped_and_resumed() {
     for file in ["unet/config.json", "vae/config.json", "scheduler/scheduler_config.json"] {
         assert!(run.join("pipeline").join(file).exists(), "{file}");
     }
+    // Block by block the same network comes out, but for the order of sums.
+    must(unet(&whole.path().join("unet.toml"), &["--set", "run.name=blocks", "--set", "checkpointing=true"]));
+    let loss = |run: &Path| summary(run)["held_out"]["loss"].as_f64().unwrap();
+    let (one, other) = (loss(&run), loss(&folder(&whole, "blocks")));
+    assert!((one - other).abs() < 1e-3 * one, "{one} {other}");
+    check_adapters(&whole.path().join("unet.toml"), &run);
     let out = whole.path().join("sample.png");
     let text = |path: &Path| path.to_string_lossy().into_owned();
     let two = ["--caption", "a rainy night", "--caption", "a sunny day", "--guidance", "2"];

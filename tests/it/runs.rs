@@ -91,7 +91,7 @@ pub fn must(output: Output) -> String {
 }
 
 /// Every file of a run's last checkpoint by name.
-fn checkpoint(run: &Path) -> Vec<(String, Vec<u8>)> {
+pub fn checkpoint(run: &Path) -> Vec<(String, Vec<u8>)> {
     let folder = run.join("checkpoints/step_00000008");
     let mut files: Vec<(String, Vec<u8>)> = std::fs::read_dir(&folder)
         .unwrap_or_else(|error| panic!("{}: {error}", folder.display()))
@@ -120,7 +120,7 @@ pub fn assert_equal_parts(a: &Path, b: &Path, parts: &[&str]) {
     }
 }
 
-fn tensors(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
+pub fn tensors(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
     let file = safetensors::SafeTensors::deserialize(bytes).unwrap();
     let mut tensors: Vec<(String, Vec<u8>)> =
         file.iter().map(|(name, view)| (name.to_owned(), view.data().to_vec())).collect();

@@ -76,6 +76,12 @@ pub fn attach<M: Module + LoraSites>(mut model: M, name: &str, config: &LoraConf
     Ok(model)
 }
 
+/// Whether a parameter path, such as `blocks.0.to_q.lora.stack.0.up`, leads to a factor of an adapter.
+#[must_use]
+pub fn is_factor(path: &str) -> bool {
+    path.contains(".lora.stack.")
+}
+
 /// Takes an adapter off.
 ///
 /// # Errors

@@ -9,6 +9,10 @@ use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::Tensor;
 
+mod graph;
+
+pub use graph::{SegmentGraph, Slot};
+
 /// How one block computes: block, state, condition to the next state.
 pub type RunBlock<'a, M, const D: usize, const C: usize> = &'a dyn Fn(&M, Tensor<D>, Tensor<C>) -> Tensor<D>;
 

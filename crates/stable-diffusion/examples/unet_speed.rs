@@ -1,8 +1,8 @@
-//! Time of the UNet's forward and backward pass, for `benches/peers/unet_speed.py`.
+//! Time of the UNet's forward and backward pass, for `benches/peer/unet_speed.py`.
 //!
 //! `unet_speed tiny DIR` writes the network as a folder, then answers each line on standard input with the seconds of one forward
-//! and backward pass. `unet_speed full` builds SD 1.5 and runs one denoising step, then one step with gradients; it prints seconds
-//! and peak memory.
+//! and backward pass. `unet_speed full` builds SD 1.5 and runs one denoising step, `unet_speed gradients` one step with the gradients of
+//! all parameters in segments, `unet_speed tape` the same on one tape; they print seconds and peak memory.
 
 use std::error::Error;
 use std::io::{BufRead, Write};
@@ -15,7 +15,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use nn::Init;
 use nn::golden::golden_stream;
 use stable_diffusion::layout::save_folder;
-use stable_diffusion::{Preset, UNet2DCondition};
+use stable_diffusion::{Preset, UNet2DCondition, UNetInputs};
 
 type Outcome<T> = Result<T, Box<dyn Error>>;
 
@@ -27,7 +27,9 @@ fn main() -> Outcome<()> {
     match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["tiny", folder] => tiny(Path::new(folder)),
         ["full"] => full(),
-        _ => Err("unet_speed tiny DIR | full".into()),
+        ["gradients"] => gradients(true),
+        ["tape"] => gradients(false),
+        _ => Err("unet_speed tiny DIR | full | gradients | tape".into()),
     }
 }
 
@@ -74,11 +76,29 @@ fn full() -> Outcome<()> {
     let said = unet.forward(x.clone(), &[500.0], noise("text", [1, 77, 768], &plain)).square().mean();
     let value = said.into_scalar::<f32>();
     writeln!(out, "one denoising step {:.1} s, mean square {value}, peak {}", started.elapsed().as_secs_f64(), peak())?;
-    drop(unet);
-    let device = plain.autodiff();
+    Ok(())
+}
+
+/// One step of SD 1.5 with the gradients of all parameters.
+fn gradients(segments: bool) -> Outcome<()> {
+    let (plain, device) = (Device::flex(), Device::flex().autodiff());
     let unet = UNet2DCondition::new(&Preset::Sd15.unet(), &mut Init::new(1, &device));
-    let (seconds, value) = step(&unet, [1, 4, 28, 50], 77, &device);
-    writeln!(out, "one step with all gradients {seconds:.1} s, mean square {value}, peak {}", peak())?;
+    let (seconds, value) = if segments {
+        let context = noise("text", [1, 77, 768], &plain);
+        let inputs = UNetInputs { timesteps: &[500.0], context, views: None, control: None };
+        let started = Instant::now();
+        let pass = unet.forward_segments(noise("sample", [1, 4, 28, 50], &plain), &inputs);
+        let answer = pass.output();
+        let value = answer.clone().square().mean().into_scalar::<f32>();
+        let upstream = answer.clone() * (2.0 / answer.shape().num_elements() as f64);
+        let found = pass.backward(&unet, upstream);
+        assert!(!found.params.is_empty());
+        (started.elapsed().as_secs_f64(), value)
+    } else {
+        step(&unet, [1, 4, 28, 50], 77, &device)
+    };
+    let peak = peak();
+    writeln!(std::io::stdout(), "one step with all gradients {seconds:.1} s, mean square {value}, peak {peak}")?;
     Ok(())
 }
 

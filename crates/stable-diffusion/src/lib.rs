@@ -27,5 +27,8 @@ pub use panels::{Panels, join_width, split_width};
 pub use preset::Preset;
 pub use resnet::{ResnetBlock, ResnetSizes};
 pub use text::{ClipTextConfig, ClipTextModel, ClipTokenizer, SmallTextEncoder, TextEncoder, TokenBatch, Tokenizer};
-pub use unet::{AttentionHeads, EncoderConfig, ProjectionKind, UNet2DCondition, UNetConfig, UNetInputs};
+pub use unet::{
+    AttentionHeads, EncoderConfig, ProjectionKind, SegmentedUNet, UNet2DCondition, UNetConfig, UNetGradients,
+    UNetInputs,
+};
 pub use vae::{AutoencoderKL, Posterior, Tiling, VaeConfig};

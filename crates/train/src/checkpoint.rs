@@ -16,7 +16,7 @@ use serde_json::Value;
 use crate::TrainError;
 use crate::files::{fingerprint, sha256, sync_file, sync_folder, write_synced};
 use crate::params::{NamedTensors, named_parameters};
-use crate::weights::{load_named, read_tensors, write_tensors};
+use crate::weights::{Keep, load_named, load_part, read_tensors, write_tensors};
 
 pub(crate) const STATE_FILE: &str = "state.json";
 /// Raised when old checkpoints can no longer be read.
@@ -92,6 +92,16 @@ impl CheckpointWriter {
     /// When the file cannot be written.
     pub fn module<M: Module>(&mut self, name: &str, module: &M) -> Result<(), TrainError> {
         self.tensors(name, &named_parameters(module))
+    }
+
+    /// As [`CheckpointWriter::module`] for the parameters whose path `keep` accepts.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn module_part<M: Module>(&mut self, name: &str, module: &M, keep: Keep) -> Result<(), TrainError> {
+        let mut parameters = named_parameters(module);
+        parameters.retain(|path, _| keep(path));
+        self.tensors(name, &parameters)
     }
 
     /// Stores tensors as `<name>.safetensors`; the config text is kept in its metadata.
@@ -194,6 +204,14 @@ impl CheckpointReader {
     /// [`TrainError::WeightMismatch`] with every difference when the part belongs to another module.
     pub fn module<M: Module>(&self, name: &str, module: M) -> Result<M, TrainError> {
         load_named(module, &self.part(name)?)
+    }
+
+    /// As [`CheckpointReader::module`] for the parameters whose path `keep` accepts; the others stay as they are.
+    ///
+    /// # Errors
+    /// As [`CheckpointReader::module`].
+    pub fn module_part<M: Module>(&self, name: &str, module: M, keep: Keep) -> Result<M, TrainError> {
+        load_part(module, &self.part(name)?, keep)
     }
 
     /// Loads the part `name` as tensors on a device, without autodiff.

@@ -9,7 +9,7 @@ use crate::TrainError;
 use crate::checkpoint::{CheckpointReader, CheckpointWriter};
 use crate::lanes::for_each_job;
 use crate::params::{NamedTensor, NamedTensors, inner_device, map_parameters, named_parameters};
-use crate::weights::WeightDiff;
+use crate::weights::{ALL, Keep, WeightDiff};
 
 /// Settings of an [`Ema`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,18 +28,26 @@ impl Default for EmaConfig {
     }
 }
 
-/// Moving average `a = d·a + (1-d)·p` of all float parameters of a module; starts as a copy of them.
+/// Moving average `a = d·a + (1-d)·p` of float parameters of a module; starts as a copy of them.
 #[derive(Clone, Debug)]
 pub struct Ema {
     config: EmaConfig,
     updates: u64,
     average: NamedTensors,
+    keep: Keep,
 }
 
 impl Ema {
     /// An average that equals `module` now.
     pub fn new<M: Module>(config: EmaConfig, module: &M) -> Self {
-        Self { config, updates: 0, average: named_parameters(module) }
+        Self::of_part(config, module, ALL)
+    }
+
+    /// An average of the parameters whose path `keep` accepts: where the others are frozen, they need none.
+    pub fn of_part<M: Module>(config: EmaConfig, module: &M, keep: Keep) -> Self {
+        let mut average = named_parameters(module);
+        average.retain(|path, _| keep(path));
+        Self { config, updates: 0, average, keep }
     }
 
     /// Decay of the next update.
@@ -96,7 +104,7 @@ impl Ema {
     pub fn load<M: Module>(&mut self, reader: &CheckpointReader, name: &str, module: &M) -> Result<(), TrainError> {
         let Some(device) = inner_device(module) else { return Ok(()) };
         let stored = reader.tensors(name, &device)?;
-        WeightDiff::between(module, &stored).into_result(&reader.file(name))?;
+        WeightDiff::between(module, &stored, self.keep).into_result(&reader.file(name))?;
         self.updates = reader.value(&format!("{name}.updates"))?;
         self.average = stored;
         Ok(())

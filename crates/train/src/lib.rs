@@ -55,4 +55,4 @@ pub use task::{BatchSource, ScalarValue, Scalars, StepContext, StepOutput, Task}
 pub use tensorboard::EventWriter;
 pub use train_loop::{BestRule, Goal, Outcome, RunSetup, TrainConfig, train};
 pub use update::{GradientClip, Optimizer, Update};
-pub use weights::{WeightDiff, load_named, read_config_text, save_named};
+pub use weights::{Keep, WeightDiff, load_named, read_config_text, save_named};

@@ -17,6 +17,12 @@ use crate::params::{NamedTensor, NamedTensors, inner_device, list_parameters, ma
 /// Key under which a weight file carries the text of the experiment's config.
 const CONFIG_KEY: &str = "config";
 
+/// Which parameters, by path.
+pub type Keep = fn(&str) -> bool;
+
+/// Every parameter.
+pub(crate) const ALL: Keep = |_| true;
+
 /// How stored tensors differ from a module's parameters.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct WeightDiff {
@@ -29,11 +35,11 @@ pub struct WeightDiff {
 }
 
 impl WeightDiff {
-    /// Compares names and shapes.
-    pub(crate) fn between<M: Module>(module: &M, stored: &NamedTensors) -> Self {
+    /// Compares names and shapes of the parameters whose path `keep` accepts.
+    pub(crate) fn between<M: Module>(module: &M, stored: &NamedTensors, keep: Keep) -> Self {
         let mut diff = Self::default();
         let mut unexpected: std::collections::BTreeSet<&String> = stored.keys().collect();
-        for info in list_parameters(module) {
+        for info in list_parameters(module).into_iter().filter(|info| keep(&info.path)) {
             unexpected.remove(&info.path);
             match stored.get(&info.path) {
                 None => diff.missing.push(info.path),
@@ -83,9 +89,14 @@ pub fn save_named<M: Module>(module: &M, path: &Path, config: Option<&str>) -> R
 /// [`TrainError::WeightMismatch`] with every difference when the file holds anything but exactly this module's
 /// parameters, [`TrainError::Damaged`] when it is no such file.
 pub fn load_named<M: Module>(module: M, path: &Path) -> Result<M, TrainError> {
+    load_part(module, path, ALL)
+}
+
+/// As [`load_named`] for the parameters whose path `keep` accepts; the others stay.
+pub(crate) fn load_part<M: Module>(module: M, path: &Path, keep: Keep) -> Result<M, TrainError> {
     let Some(device) = inner_device(&module) else { return Ok(module) };
     let mut stored = read_tensors(path, &device)?;
-    WeightDiff::between(&module, &stored).into_result(path)?;
+    WeightDiff::between(&module, &stored, keep).into_result(path)?;
     Ok(map_parameters(module, |info, own| stored.remove(&info.path).map_or(own, |tensor| tensor.values)))
 }
 

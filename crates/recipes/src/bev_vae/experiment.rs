@@ -94,8 +94,11 @@ impl Default for LossConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PerceptualConfig {
-    /// Convolutions of VGG-16 in torchvision's or Oxford's layout, safetensors.
+    /// Convolutions of VGG-16 in torchvision's or Oxford's layout, safetensors or `.pth`.
     pub weights: Option<PathBuf>,
+    /// Linear heads of LPIPS 0.1 (`lpips_linear_heads_v0.1.safetensors`, or the release's file for VGG). With them the term is LPIPS,
+    /// which needs torchvision's kernels; without, the mean squared difference of features.
+    pub heads: Option<PathBuf>,
     /// Factor on the term.
     pub weight: f64,
     /// Deepest tap.
@@ -106,7 +109,7 @@ pub struct PerceptualConfig {
 
 impl Default for PerceptualConfig {
     fn default() -> Self {
-        Self { weights: None, weight: 1.0, last: Tap::Relu5_3, views: 0 }
+        Self { weights: None, heads: None, weight: 1.0, last: Tap::Relu5_3, views: 0 }
     }
 }
 

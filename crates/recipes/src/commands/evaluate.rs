@@ -1,5 +1,6 @@
 //! `rigscape evaluate`: pictures against pictures, every number with its protocol.
 
+mod labels;
 mod sides;
 mod statistics;
 
@@ -9,19 +10,16 @@ use std::time::Instant as Clock;
 
 use anyhow::{Context, bail};
 use clap::Parser;
-use data::DatasetConfig;
-use data::nuscenes::NuScenes;
 use metrics::Protocol;
-use metrics::detection::DetectionResults;
 use sha2::{Digest, Sha256};
 use train::{DeviceConfig, head_commit};
 
+use self::labels::labels;
 use self::sides::{Sides, model, painted, stored};
 use self::statistics::{replaced, save_statistics};
 use super::common::{DataArgs, LoadedModel, UsageError, say};
 use crate::evaluate::{
-    NetworkFolder, Pass, PassOptions, PictureSource, Report, Side, detection_markdown, detection_score, draw_report,
-    needs_pairs, numbers, write_file,
+    NetworkFolder, Pass, PassOptions, PictureSource, Report, Side, draw_report, needs_pairs, numbers, write_file,
 };
 use crate::sheet::save_picture;
 
@@ -46,7 +44,14 @@ pub struct EvaluateArgs {
     /// Result file of a detector in the nuScenes benchmark's form: its detection score on --nuscenes and --split
     #[arg(long, value_name = "FILE", requires = "nuscenes", conflicts_with_all = ["real", "generated", "checkpoint"])]
     pub detections: Option<PathBuf>,
-    /// Data for --checkpoint [default: the experiment's held-out data] and --detections
+    /// Folder of a bird's-eye-view segmenter's rasters: for every frame of the data `<frame>.npy`, probabilities of road and vehicle
+    /// [2, 200, 200], row 0 ahead, column 0 left, 0.5 m a cell
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["real", "generated", "checkpoint"])]
+    pub segmentation: Option<PathBuf>,
+    /// With both: the W-CODA score, from this Frechet video distance of the same pictures
+    #[arg(long, value_name = "FVD", requires = "detections", requires = "segmentation")]
+    pub wcoda_fvd: Option<f64>,
+    /// Data for --checkpoint [default: the experiment's held-out data], --detections and --segmentation
     #[command(flatten)]
     pub data: DataArgs,
     /// Statistics of the real set instead of its pictures: .safetensors of --save-stats or .npz of pytorch-fid
@@ -121,8 +126,8 @@ pub fn evaluate(args: &EvaluateArgs) -> anyhow::Result<()> {
     if args.list {
         return known.iter().try_for_each(|protocol| say(format_args!("{:<20} {}", protocol.name, protocol.text)));
     }
-    if let Some(path) = &args.detections {
-        return detections(args, path);
+    if args.detections.is_some() || args.segmentation.is_some() {
+        return labels(args);
     }
     let folders = weight_folders(args);
     let protocols = chosen(args, &known, !folders.is_empty())?;
@@ -143,19 +148,6 @@ pub fn evaluate(args: &EvaluateArgs) -> anyhow::Result<()> {
             run(args, &protocols, &NetworkFolder { folders, device }, stored(args)?, BTreeMap::new())
         }
     }
-}
-
-fn detections(args: &EvaluateArgs, path: &Path) -> anyhow::Result<()> {
-    let results = DetectionResults::read(path)?;
-    let configs = args.data.configs()?;
-    let [DatasetConfig::NuScenes(config)] = configs.as_slice() else {
-        return Err(UsageError::of("the detection score needs one nuScenes dataset: --nuscenes DIR --split NAME"));
-    };
-    let score = detection_score(&NuScenes::open(config)?, results)?;
-    say(detection_markdown(&score))?;
-    let Some(out) = &args.out else { return Ok(()) };
-    let report = serde_json::json!({ "code": code_version(), "protocol": "nds/detection_cvpr_2019", "split": config.split, "score": score });
-    write_file(&out.join("detections.json"), serde_json::to_string_pretty(&report)?.as_bytes())
 }
 
 fn known_protocols(args: &EvaluateArgs) -> anyhow::Result<Vec<Protocol>> {

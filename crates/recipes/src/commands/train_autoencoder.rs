@@ -7,7 +7,9 @@ use stable_diffusion::layout::save_folder;
 use train::Outcome;
 
 use super::common::say;
-use super::training::{LoopFigures, Prepared, TrainArgs, loop_line, prepare, train_experiment, write_summary};
+use super::training::{
+    LoopFigures, Prepared, TrainArgs, loop_line, prepare, print_config, train_experiment, write_summary,
+};
 use crate::autoencoder::{AutoencoderExperiment, AutoencoderTask, PictureEvaluator};
 use crate::bev_vae::{MeanPictures, Scores};
 
@@ -43,6 +45,9 @@ struct Summary {
 /// # Errors
 /// Anything that keeps the run from its end; checkpoints written so far stay usable.
 pub fn train_autoencoder(args: &TrainAutoencoderArgs) -> anyhow::Result<()> {
+    if args.run.print_config {
+        return print_config::<AutoencoderExperiment>(&args.run);
+    }
     let mut run: Prepared<AutoencoderExperiment> = prepare(&args.run)?;
     let mut task = AutoencoderTask::new(&run.experiment, &run.device.clone().autodiff(), evaluator(&run)?)?;
     let outcome = run.train(&mut task, &args.run)?;

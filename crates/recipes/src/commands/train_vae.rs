@@ -6,7 +6,9 @@ use serde::Serialize;
 use train::Outcome;
 
 use super::common::say;
-use super::training::{LoopFigures, Prepared, TrainArgs, loop_line, prepare, train_experiment, write_summary};
+use super::training::{
+    LoopFigures, Prepared, TrainArgs, loop_line, prepare, print_config, train_experiment, write_summary,
+};
 use crate::bev_vae::{BevVaeTask, Evaluation, Evaluator, Experiment, MeanPictures, Scores};
 
 /// Train BEV-VAE: pictures of any camera rig to one bird's-eye-view latent and back
@@ -39,6 +41,9 @@ struct Summary {
 /// # Errors
 /// Anything that keeps the run from its end; checkpoints written so far stay usable.
 pub fn train_vae(args: &TrainVaeArgs) -> anyhow::Result<()> {
+    if args.run.print_config {
+        return print_config::<Experiment>(&args.run);
+    }
     let mut run: Prepared<Experiment> = prepare(&args.run)?;
     let mut task = BevVaeTask::new(&run.experiment, &run.device.clone().autodiff(), evaluator(&run)?)?;
     let outcome = run.train(&mut task, &args.run)?;

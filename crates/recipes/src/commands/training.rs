@@ -11,7 +11,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use train::{DeviceConfig, Interrupt, OnExisting, Outcome, RunDir, RunSetup, Task, TrainConfig};
 
-use super::common::open_all;
+use super::common::{open_all, say};
 use crate::LoaderSource;
 use crate::bev_vae::{DataConfig, RunConfig};
 use crate::config_file;
@@ -34,6 +34,9 @@ pub struct TrainArgs {
     /// Stop, saved and ready for --resume, after this many steps of the whole run
     #[arg(long, value_name = "STEPS")]
     pub stop_after: Option<u64>,
+    /// Print the experiment with the defaults of all settings it leaves out, and stop
+    #[arg(long)]
+    pub print_config: bool,
 }
 
 /// What every experiment file has.
@@ -93,13 +96,24 @@ pub(super) struct Prepared<E> {
     interrupt: Interrupt,
 }
 
-/// Reads the experiment, opens device and data, and makes the run's folder.
-pub(super) fn prepare<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Result<Prepared<E>> {
+/// The experiment as a run would take it.
+fn read<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Result<E> {
     let experiment: E = config_file::load(&args.config, &args.overrides)?;
     let mut experiment = experiment.checked().with_context(|| format!("in the config {}", args.config.display()))?;
     if let Some(device) = args.device {
         *experiment.device() = device;
     }
+    Ok(experiment)
+}
+
+/// Prints the experiment as TOML with its defaults: a config again. Settings without a value are not listed.
+pub(super) fn print_config<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Result<()> {
+    say(toml::to_string(&read::<E>(args)?).context("cannot write the resolved config")?.trim_end())
+}
+
+/// Reads the experiment, opens device and data, and makes the run's folder.
+pub(super) fn prepare<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Result<Prepared<E>> {
+    let mut experiment: E = read(args)?;
     if experiment.data().train.is_empty() || experiment.data().validation.is_empty() {
         bail!("data.train and data.validation need at least one dataset each: {}", args.config.display());
     }

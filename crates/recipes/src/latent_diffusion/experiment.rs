@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::ensure;
 use data::{ImageSize, LoaderConfig};
 use diffusion::{Ddim, FinalLevel, LossWeight, NoiseSchedule, SamplerConfig, ScheduleConfig, Spacing, Target};
+use nn::lora::LoraConfig;
 use serde::{Deserialize, Serialize};
 use stable_diffusion::Panels;
 use train::{DeviceConfig, EmaConfig, OptimizerConfig, TrainConfig};
@@ -28,6 +29,16 @@ pub struct UNetExperiment {
     pub run: RunConfig,
     /// Sizes of the UNet. With `encoder.cross_view` or joined panels the views of a rig are made together, else each alone.
     pub model: Choice<UNetSizes>,
+    /// Weights to start from instead of fresh ones: a run or checkpoint folder of `train-unet` (its averaged weights), or a folder in
+    /// diffusers' layout that holds `unet`. Optimizer and step count start anew.
+    #[serde(default)]
+    pub init_from: Option<PathBuf>,
+    /// Train low-rank adapters beside the weights of `init_from`, which stay as they are.
+    #[serde(default)]
+    pub adapter: Option<LoraConfig>,
+    /// Differentiate the UNet block by block, each computed twice: the memory of one block instead of all, about a third more time.
+    #[serde(default)]
+    pub checkpointing: bool,
     /// What reads captions.
     #[serde(default)]
     pub text: TextConfig,
@@ -133,6 +144,10 @@ impl UNetExperiment {
             "sampling.sampler: flow_euler samples rectified flows, and train-unet trains on a noise schedule"
         );
         self.sampling.sampler.checked(&schedule, self.diffusion.target)?;
+        ensure!(
+            self.adapter.is_none() || self.init_from.is_some(),
+            "[adapter] learns beside trained weights: init_from must name them"
+        );
         let dropout = self.diffusion.caption_dropout;
         ensure!((0.0..=1.0).contains(&dropout), "diffusion.caption_dropout must lie in 0..=1, not {dropout}");
         ensure!(self.sampling.guidance.is_finite(), "sampling.guidance must be a number");

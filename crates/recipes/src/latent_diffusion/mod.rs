@@ -7,6 +7,7 @@ mod latents;
 mod neighbours;
 mod painter;
 mod sample;
+mod start;
 mod step;
 mod task;
 mod text;

@@ -5,10 +5,10 @@ use std::path::Path;
 use anyhow::Context;
 use burn::tensor::Device;
 use data::SceneBatch;
-use nn::Init;
 use train::{DeviceConfig, find_checkpoint};
 
 use super::sample::Sampler;
+use super::start::{first_weights, learning};
 use super::step::Frozen;
 use super::{Denoiser, UNetExperiment};
 use crate::config_file;
@@ -33,9 +33,12 @@ impl Painter {
             .with_context(|| format!("in the config that the checkpoint carries: {}", reader.folder().display()))?;
         let device = device.unwrap_or(experiment.device).open()?;
         let frozen = Frozen::open(&experiment, &device)?;
-        let denoiser =
-            frozen.captioner.denoiser(&experiment.text, &experiment.model.config, &mut Init::new(0, &device));
-        let denoiser = reader.module("ema", denoiser)?;
+        let adapted = experiment.adapter.is_some();
+        // What the checkpoint holds whole needs no start.
+        let start =
+            UNetExperiment { init_from: experiment.init_from.clone().filter(|_| adapted), ..experiment.clone() };
+        let denoiser = first_weights(&start, &frozen.captioner, &device)?;
+        let denoiser = reader.module_part("ema", denoiser, learning(&experiment))?;
         Ok(Self { experiment, frozen, denoiser, device })
     }
 

@@ -1,13 +1,13 @@
 //! One training step of latent diffusion: Ho et al., "Denoising Diffusion Probabilistic Models", algorithm 1, on the latents of all
 //! views of a rig at once (Gao et al., MagicDrive: one timestep per sample, noise per view).
 
-use burn::optim::GradientsParams;
+use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use data::SceneBatch;
 use diffusion::NoiseSchedule;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use stable_diffusion::UNetInputs;
+use stable_diffusion::{Adjacency, UNetInputs};
 use train::{StepContext, StepOutput};
 
 use super::{Captioner, Denoiser, DiffusionConfig, LatentCoder, Neighbours, UNetExperiment};
@@ -19,6 +19,8 @@ pub struct Frozen {
     pub captioner: Captioner,
     pub schedule: NoiseSchedule,
     pub config: DiffusionConfig,
+    /// Whether gradients are taken block by block.
+    pub checkpointing: bool,
 }
 
 /// A batch as the network meets it; N = B·V.
@@ -57,6 +59,7 @@ impl Frozen {
             coder: LatentCoder::open(&experiment.autoencoder, (experiment.image, channels), device)?,
             schedule: NoiseSchedule::new(&experiment.diffusion.schedule)?,
             config: experiment.diffusion.clone(),
+            checkpointing: experiment.checkpointing,
         })
     }
 
@@ -98,18 +101,47 @@ impl Frozen {
     /// # Errors
     /// Never for neighbours of the same batch.
     pub fn answer(&self, denoiser: &Denoiser, problem: &Problem) -> anyhow::Result<Tensor<4>> {
-        let states = self.captioner.states(denoiser, &problem.captions);
-        let needs_views = denoiser.unet.config().encoder.needs_views();
-        let adjacency = needs_views.then(|| problem.neighbours.adjacency(1)).transpose()?;
-        let inputs = UNetInputs {
-            timesteps: &problem.timesteps,
-            context: per_view(states, problem.views),
-            views: adjacency.as_ref(),
-            control: None,
-        };
+        let states = per_view(self.captioner.states(denoiser, &problem.captions), problem.views);
+        let adjacency = self.adjacency(denoiser, problem)?;
         let noisy = problem.noisy.clone();
         let noisy = if denoiser.on_tape() { Tensor::from_inner(noisy) } else { noisy };
-        Ok(denoiser.unet.forward_with(noisy, &inputs))
+        Ok(denoiser.unet.forward_with(noisy, &inputs(problem, states, adjacency.as_ref())))
+    }
+
+    fn adjacency(&self, denoiser: &Denoiser, problem: &Problem) -> anyhow::Result<Option<Adjacency>> {
+        denoiser.unet.config().encoder.needs_views().then(|| problem.neighbours.adjacency(1)).transpose()
+    }
+
+    /// Loss and gradients of a problem, with all inner values on the tape at once.
+    fn gradients(&self, denoiser: &Denoiser, problem: &Problem) -> anyhow::Result<(Tensor<1>, GradientsParams)> {
+        if self.checkpointing {
+            return self.gradients_in_segments(denoiser, problem);
+        }
+        let loss = self.loss(self.answer(denoiser, problem)?, problem);
+        Ok((loss.clone(), GradientsParams::from_grads(loss.backward(), denoiser)))
+    }
+
+    /// The same with the inner values of one block of the UNet at a time.
+    fn gradients_in_segments(
+        &self,
+        denoiser: &Denoiser,
+        problem: &Problem,
+    ) -> anyhow::Result<(Tensor<1>, GradientsParams)> {
+        let states = per_view(self.captioner.states(denoiser, &problem.captions), problem.views);
+        let adjacency = self.adjacency(denoiser, problem)?;
+        let inputs = inputs(problem, states.clone().inner(), adjacency.as_ref());
+        let pass = denoiser.unet.forward_segments(problem.noisy.clone(), &inputs);
+        let answer = Tensor::from_inner(pass.output()).require_grad();
+        let loss = self.loss(answer.clone(), problem);
+        let upstream = answer.grad(&loss.backward()).expect("the loss is of the answer");
+        let found = pass.backward(denoiser, upstream);
+        let mut all = GradientsAccumulator::new();
+        all.accumulate(denoiser, found.params);
+        let text = (states * Tensor::from_inner(found.context)).sum();
+        if text.is_tracked() {
+            all.accumulate(denoiser, GradientsParams::from_grads(text.backward(), denoiser));
+        }
+        Ok((loss, all.grads()))
     }
 
     /// Weighted mean squared error of an answer, `[1]`.
@@ -143,11 +175,16 @@ impl Frozen {
                 caption.clear();
             }
         }
-        let loss = self.loss(self.answer(denoiser, &problem)?, &problem);
+        let (loss, gradients) = self.gradients(denoiser, &problem)?;
         let mut output = StepOutput::new(batch.target.mask.iter().filter(|present| **present).count());
-        output.push("loss", loss.clone());
-        Ok((GradientsParams::from_grads(loss.backward(), denoiser), output))
+        output.push("loss", loss);
+        Ok((gradients, output))
     }
+}
+
+/// What the UNet is told.
+fn inputs<'a>(problem: &'a Problem, context: Tensor<3>, views: Option<&'a Adjacency>) -> UNetInputs<'a> {
+    UNetInputs { timesteps: &problem.timesteps, context, views, control: None }
 }
 
 /// The states of each sample for each of its views.

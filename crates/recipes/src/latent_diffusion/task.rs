@@ -1,16 +1,19 @@
 //! The `Task` of latent diffusion.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
+use anyhow::Context;
 use burn::module::Module;
 use burn::tensor::Device;
 use data::SceneBatch;
-use nn::Init;
+use nn::lora::{self, LoraLayout};
 use train::{
     CheckpointReader, CheckpointWriter, Ema, GradientMean, Optimizer, Scalars, StepContext, StepOutput, Task,
     TrainError, in_lanes,
 };
 
+use super::start::{ADAPTER, first_weights, learning};
 use super::step::Frozen;
 use super::{Denoiser, DiffusionEvaluator, DiffusionScores, UNetExperiment, save_pipeline};
 
@@ -32,11 +35,10 @@ impl UNetTask {
     /// A missing or unfitting autoencoder or text encoder.
     pub fn new(experiment: &UNetExperiment, device: &Device, evaluator: DiffusionEvaluator) -> anyhow::Result<Self> {
         let frozen = Frozen::open(experiment, device)?;
-        let mut init = Init::new(experiment.seed, device);
-        let denoiser = frozen.captioner.denoiser(&experiment.text, &experiment.model.config, &mut init);
+        let denoiser = first_weights(experiment, &frozen.captioner, device)?;
         experiment.optimizer.check(&denoiser)?;
         Ok(Self {
-            ema: Ema::new(experiment.ema, &denoiser),
+            ema: Ema::of_part(experiment.ema, &denoiser, learning(experiment)),
             optimizer: Optimizer::new(&experiment.optimizer),
             experiment: experiment.clone(),
             device: device.clone(),
@@ -67,12 +69,23 @@ impl UNetTask {
         self.evaluator.pictures(&self.frozen, &self.averaged(), &self.experiment.sampling, path)
     }
 
-    /// Writes the averaged weights in diffusers' layout.
+    /// Writes the averaged weights in diffusers' layout into a folder of the run, which it returns: `pipeline`, or for adapters `lora`,
+    /// whose file diffusers adds to the pipeline it was trained on.
     ///
     /// # Errors
     /// Names the file that cannot be written.
-    pub fn export(&self, root: &Path) -> anyhow::Result<()> {
-        save_pipeline(root, &self.averaged(), &self.frozen.coder, &self.experiment.diffusion)
+    pub fn export(&self, run: &Path) -> anyhow::Result<PathBuf> {
+        let averaged = self.averaged();
+        if self.experiment.adapter.is_none() {
+            let root = run.join("pipeline");
+            save_pipeline(&root, &averaged, &self.frozen.coder, &self.experiment.diffusion)?;
+            return Ok(root);
+        }
+        let root = run.join("lora");
+        std::fs::create_dir_all(&root).with_context(|| format!("cannot make the folder {}", root.display()))?;
+        let path = root.join("pytorch_lora_weights.safetensors");
+        lora::save(&averaged.unet, ADAPTER, &path, ("unet", LoraLayout::Peft), &BTreeMap::new())?;
+        Ok(root)
     }
 }
 
@@ -117,13 +130,13 @@ impl Task for UNetTask {
     }
 
     fn save(&self, writer: &mut CheckpointWriter) -> Result<(), TrainError> {
-        writer.module("model", &self.denoiser)?;
+        writer.module_part("model", &self.denoiser, learning(&self.experiment))?;
         self.ema.save(writer, "ema")?;
         self.optimizer.save(writer, "optimizer")
     }
 
     fn load(&mut self, reader: &CheckpointReader) -> Result<(), TrainError> {
-        self.denoiser = reader.module("model", self.denoiser.clone())?;
+        self.denoiser = reader.module_part("model", self.denoiser.clone(), learning(&self.experiment))?;
         self.ema.load(reader, "ema", &self.denoiser)?;
         self.optimizer.load(reader, "optimizer", &self.denoiser)
     }

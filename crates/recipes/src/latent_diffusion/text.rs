@@ -14,7 +14,7 @@ use stable_diffusion::{ClipTextModel, SmallTextEncoder, Tokenizer, UNet2DConditi
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TextConfig {
-    /// Learned from nothing, with the UNet; one token per byte.
+    /// Learned from nothing, with the UNet; one token per word.
     Small(SmallTextConfig),
     /// Published weights, frozen: a folder that holds `tokenizer` and `text_encoder`.
     Clip(PathBuf),

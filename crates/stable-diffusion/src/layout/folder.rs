@@ -162,12 +162,20 @@ impl Network for ControlNet {
 /// # Errors
 /// [`FolderError`]: unreadable files, unsupported config entries, weights that do not fit.
 pub fn load_folder<N: Network>(folder: impl AsRef<Path>, device: &Device) -> Result<N, FolderError> {
+    let (config, file) = open_folder::<N>(folder)?;
+    // First values would only be replaced; and no memory is taken before the file's shapes are known to be the config's.
+    Ok(load_weights(N::build(&config, &mut Init::lazy(0, device)), &file)?)
+}
+
+/// Sizes and weight file of a network's folder.
+///
+/// # Errors
+/// [`FolderError`]: unreadable files, unsupported config entries.
+pub fn open_folder<N: Network>(folder: impl AsRef<Path>) -> Result<(N::Config, WeightFile), FolderError> {
     let folder = folder.as_ref();
     let config = read_config::<N>(&folder.join(CONFIG_FILE))?;
     let found = READ_FILES.map(|name| folder.join(name)).into_iter().find(|path| path.exists());
-    let file = WeightFile::open(found.unwrap_or_else(|| folder.join(WEIGHTS_FILE)))?;
-    // First values would only be replaced; and no memory is taken before the file's shapes are known to be the config's.
-    Ok(load_weights(N::build(&config, &mut Init::lazy(0, device)), &file)?)
+    Ok((config, WeightFile::open(found.unwrap_or_else(|| folder.join(WEIGHTS_FILE)))?))
 }
 
 fn read_config<N: Network>(path: &Path) -> Result<N::Config, FolderError> {

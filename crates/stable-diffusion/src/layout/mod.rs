@@ -10,6 +10,6 @@ pub mod single_file;
 
 pub use folder::{
     CONFIG_FILE, CROSS_VIEW_MODULES, FolderError, Network, WEIGHTS_FILE, load_folder, load_weights,
-    load_weights_beside, save_folder,
+    load_weights_beside, open_folder, save_folder,
 };
 pub use names::{fill_by_state_dict_name, state_dict_name, state_dict_params, state_dict_shapes};

@@ -28,6 +28,6 @@ pub use error::TextError;
 pub use folder::{load_clip, load_text_encoder, load_text_weights, load_tokenizer, save_clip};
 pub use single_file::text_single_file_tensors;
 pub use small::{SmallTextConfig, SmallTextEncoder};
-pub use tokenizer::{ByteTokenizer, ClipTokenizer, Padding, Tokenizer};
+pub use tokenizer::{ClipTokenizer, Padding, Tokenizer, WordTokenizer};
 pub use tokens::TokenBatch;
 pub use transformer::{EncoderLayer, FeedForward, SelfAttention};

@@ -6,7 +6,7 @@ use nn::{Init, LayerNorm, lora_sites};
 use serde::{Deserialize, Serialize};
 
 use super::transformer::{Embeddings, Encoder, LayerSizes};
-use super::{Activation, ClipTokenizer, TextError, TextStates, TokenBatch, Tokenizer, tokenizer::ByteTokenizer};
+use super::{Activation, ClipTokenizer, TextError, TextStates, TokenBatch, Tokenizer, tokenizer::WordTokenizer};
 
 /// Widening of the MLP.
 const MLP_RATIO: usize = 4;
@@ -21,15 +21,14 @@ pub struct SmallTextConfig {
     pub layers: usize,
     /// Heads; must divide the width.
     pub heads: usize,
-    /// Tokens per text, begin and end included. A caption takes about a token per word with CLIP's vocabulary and one
-    /// per letter without.
+    /// Tokens per text, begin and end included; a caption takes about one per word.
     pub tokens: usize,
 }
 
 impl Default for SmallTextConfig {
-    /// Fits the `tiny` networks: one layer pair of width 64, 128 bytes.
+    /// Fits the `tiny` networks.
     fn default() -> Self {
-        Self { width: 64, layers: 2, heads: 4, tokens: 128 }
+        Self { width: 64, layers: 2, heads: 4, tokens: 64 }
     }
 }
 
@@ -49,12 +48,12 @@ impl SmallTextConfig {
         Ok(self)
     }
 
-    /// CLIP's byte pairs if there are any, else bytes.
+    /// CLIP's byte pairs if there are any, else hashed words.
     #[must_use]
     pub fn tokenizer(&self, clip: Option<ClipTokenizer>) -> Tokenizer {
         match clip {
             Some(clip) => Tokenizer::Clip(Box::new(clip.with_context(self.tokens))),
-            None => Tokenizer::Bytes(ByteTokenizer::new(self.tokens)),
+            None => Tokenizer::Words(WordTokenizer::new(self.tokens)),
         }
     }
 }

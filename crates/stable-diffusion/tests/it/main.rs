@@ -6,6 +6,7 @@ mod folder;
 mod full_size;
 mod golden;
 mod lora;
+mod segments;
 mod single_file;
 mod text;
 mod unet;

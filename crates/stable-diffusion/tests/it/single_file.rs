@@ -1,6 +1,7 @@
 //! The original single-file layout: our names for its names, spot checks against published keys, round trips.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 use burn::module::Module;
 use burn::tensor::Device;
@@ -9,10 +10,10 @@ use nn::weights::{HostTensor, WeightError, WeightFile, write_safetensors};
 use stable_diffusion::layout::single_file::{
     SingleFileNetwork, load_single_file, save_single_file, single_file_tensors,
 };
-use stable_diffusion::layout::{state_dict_params, state_dict_shapes};
+use stable_diffusion::layout::{FolderError, load_folder, state_dict_params, state_dict_shapes};
 use stable_diffusion::{AutoencoderKL, ControlNet, Preset, UNet2DCondition};
 
-use crate::golden::golden_weights;
+use crate::golden::{folder as golden_folder, golden_weights};
 
 fn lazy() -> Init {
     Init::lazy(0, &Device::flex())
@@ -169,4 +170,43 @@ fn several_networks_share_a_file_both_ways() {
     assert_eq!(state_dict_params(&again).unwrap(), state_dict_params(&unet).unwrap());
     let again = load_single_file(AutoencoderKL::new(&Preset::Debug.vae(), &mut lazy()), &file).unwrap();
     assert_eq!(state_dict_params(&again).unwrap(), state_dict_params(&vae).unwrap());
+}
+
+/// What PyTorch wrote (`tests/peers/torch_folder.py`).
+fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
+}
+
+#[test]
+fn torch_files_in_half_precision_load_from_folders_and_checkpoints() {
+    let from_bin: AutoencoderKL = load_folder(fixture("vae"), &Device::flex()).unwrap();
+    let parameters = state_dict_params(&from_bin).unwrap();
+    let file = WeightFile::open(fixture("v1.ckpt")).unwrap();
+    let from_ckpt = load_single_file(AutoencoderKL::new(from_bin.config(), &mut lazy()), &file).unwrap();
+    assert_eq!(state_dict_params(&from_ckpt).unwrap(), parameters);
+
+    let Some(root) = golden_folder("folder") else { return };
+    let original: AutoencoderKL = load_folder(root.join("vae"), &Device::flex()).unwrap();
+    for ((name, half), (_, whole)) in parameters.iter().zip(state_dict_params(&original).unwrap()) {
+        let close = |(half, whole): (&f32, &f32)| (half - whole).abs() <= whole.abs() / 2048.0 + 3e-8;
+        assert!(half.data.iter().zip(&whole.data).all(close), "{name}");
+    }
+}
+
+#[test]
+fn damaged_torch_files_are_refused_with_their_path() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::copy(fixture("vae/config.json"), folder.path().join("config.json")).unwrap();
+    let path = folder.path().join("diffusion_pytorch_model.bin");
+    let bytes = std::fs::read(fixture("vae/diffusion_pytorch_model.fp16.bin")).unwrap();
+    let load = || load_folder::<AutoencoderKL>(folder.path(), &Device::flex());
+    for end in [0, 100, bytes.len() / 2, bytes.len() - 1] {
+        std::fs::write(&path, &bytes[..end]).unwrap();
+        let error = load().unwrap_err();
+        assert!(matches!(error, FolderError::Weights(_)) && error.to_string().contains(".bin"), "{end}: {error}");
+    }
+    // Another network's checkpoint: all differences, the file last.
+    std::fs::copy(fixture("v1.ckpt"), &path).unwrap();
+    let error = load().unwrap_err().to_string();
+    assert!(error.contains("first_stage_model.") && error.contains("diffusion_pytorch_model.bin"), "{error}");
 }

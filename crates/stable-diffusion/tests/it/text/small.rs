@@ -6,8 +6,8 @@ use burn::tensor::{Device, Tensor};
 use nn::Init;
 use nn::lora::{self, LoraConfig};
 use stable_diffusion::text::{
-    ByteTokenizer, ClipTokenizer, Padding, SmallTextConfig, SmallTextEncoder, TextCleaning, TextEncoder, TextError,
-    Tokenizer,
+    ClipTokenizer, Padding, SmallTextConfig, SmallTextEncoder, TextCleaning, TextEncoder, TextError, Tokenizer,
+    WordTokenizer,
 };
 
 use super::reference::{device, table, values};
@@ -19,13 +19,13 @@ fn config(tokens: usize) -> SmallTextConfig {
 }
 
 fn encoder(tokens: usize, device: &Device) -> SmallTextEncoder {
-    SmallTextEncoder::new(&config(tokens), ByteTokenizer::VOCABULARY, &mut Init::new(2, device))
+    SmallTextEncoder::new(&config(tokens), WordTokenizer::VOCABULARY, &mut Init::new(2, device))
 }
 
 #[test]
 fn padding_changes_nothing_before_it() {
     let model = encoder(40, &device());
-    let (short, long) = (ByteTokenizer::new(24).tokenize(&TEXTS), ByteTokenizer::new(40).tokenize(&TEXTS));
+    let (short, long) = (WordTokenizer::new(24).tokenize(&TEXTS), WordTokenizer::new(40).tokenize(&TEXTS));
     let (a, b) = (model.forward(&short), model.forward(&long));
     assert_eq!((a.states.dims(), b.states.dims()), ([3, 24, 16], [3, 40, 16]));
     for (text, length) in short.lengths().iter().enumerate() {
@@ -46,7 +46,7 @@ fn padding_changes_nothing_before_it() {
 fn it_learns_to_tell_texts_apart() {
     let device = device().autodiff();
     let mut model = TextEncoder::Small(encoder(24, &device));
-    let tokens = Tokenizer::Bytes(ByteTokenizer::new(24)).tokenize(&TEXTS);
+    let tokens = Tokenizer::Words(WordTokenizer::new(24)).tokenize(&TEXTS);
     let target = Tensor::<2>::from_floats([[1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]], &device);
     let mut optimizer = AdamConfig::new().init();
     let mut losses = Vec::new();
@@ -65,7 +65,7 @@ fn it_learns_to_tell_texts_apart() {
 #[test]
 fn byte_pairs_are_used_when_there_are_any() {
     let tokenizer = config(32).tokenizer(None);
-    assert!(matches!(tokenizer, Tokenizer::Bytes(_)));
+    assert!(matches!(tokenizer, Tokenizer::Words(_)));
     assert_eq!(tokenizer.context(), 32);
     let Some(pairs) = table() else { return };
     let clip = ClipTokenizer::new(pairs, TextCleaning::Transformers, Padding::EndToken);

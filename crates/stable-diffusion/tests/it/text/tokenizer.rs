@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::Value;
 use stable_diffusion::text::{
-    BytePairs, ByteTokenizer, ClipTokenizer, Padding, TextCleaning, TextError, Tokenizer, load_tokenizer,
+    BytePairs, ClipTokenizer, Padding, TextCleaning, TextError, Tokenizer, WordTokenizer, load_tokenizer,
 };
 
 use super::reference::{END, golden, integers, json, table};
@@ -87,18 +87,19 @@ fn ids_decode_to_the_text() {
 }
 
 #[test]
-fn bytes_need_no_file() {
-    let tokenizer = Tokenizer::Bytes(ByteTokenizer::new(8));
-    assert_eq!((tokenizer.vocabulary_size(), tokenizer.context()), (259, 8));
-    let batch = tokenizer.tokenize(&["A  \n b", "", "Größe straße"]);
-    let (begin, end, pad) = (256, 257, 258);
-    let expected = [
-        [begin, 97, 32, 98, end, pad, pad, pad],
-        [begin, end, pad, pad, pad, pad, pad, pad],
-        [begin, 103, 114, 0xC3, 0xB6, 0xC3, 0x9F, end],
-    ];
+fn words_need_no_file() {
+    let tokenizer = Tokenizer::Words(WordTokenizer::new(6));
+    assert_eq!((tokenizer.vocabulary_size(), tokenizer.context()), (8195, 6));
+    let batch = tokenizer.tokenize(&["A  \n b", "", "foobar, FooBar a b a"]);
+    let (begin, end, pad) = (8192, 8193, 8194);
+    // The low bits of published FNV-1a values: af63dc4c8601ec8c, af63df4c8601f1a5, 85944171f73967e8.
+    let (a, b, foobar) = (0xec8c & 8191, 0xf1a5 & 8191, 0x67e8 & 8191);
+    let comma = batch.ids()[14];
+    let expected =
+        [[begin, a, b, end, pad, pad], [begin, end, pad, pad, pad, pad], [begin, foobar, comma, foobar, a, end]];
     assert_eq!(batch.ids(), expected.concat());
-    assert_eq!(batch.lengths(), [5, 2, 8]);
+    assert!(![a, b, foobar].contains(&comma) && comma < begin);
+    assert_eq!(batch.lengths(), [4, 2, 6]);
     let mask: Vec<bool> = batch.attention_mask(&super::reference::device()).into_data().iter::<bool>().collect();
     assert_eq!(mask, expected.concat().iter().map(|id| *id != pad).collect::<Vec<_>>());
 }

@@ -1,7 +1,7 @@
 """Tiny UNet, forward and backward, ours against diffusers: alternating in one run, so that other load meets both.
 
     cargo build --release -p rigscape -p stable-diffusion --example unet_speed
-    python benches/peers/unet_speed.py target/release/examples/unet_speed /tmp/unet [THREADS]
+    python benches/peer/unet_speed.py target/release/examples/unet_speed /tmp/unet [THREADS]
 
 THREADS is 2 unless given; where other programs run, 1 keeps threads from waiting for each other.
 """
