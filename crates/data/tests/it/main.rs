@@ -6,6 +6,7 @@ mod clips;
 mod colmap;
 mod fuzzed;
 mod generated;
+mod latents;
 mod listed;
 mod loader;
 mod npz;
