@@ -63,7 +63,8 @@ impl LatentFolder {
         statistics: Option<LatentStatistics>,
     ) -> Result<Self, DataError> {
         let head = manifest.head;
-        let (mut shards, mut starts, mut scenes) = (Vec::new(), Vec::new(), Vec::<(String, String, Range<usize>)>::new());
+        let (mut shards, mut starts, mut scenes) =
+            (Vec::new(), Vec::new(), Vec::<(String, String, Range<usize>)>::new());
         let mut samples = 0;
         for entry in &manifest.shards {
             let file = path.join(&entry.file);
@@ -79,7 +80,9 @@ impl LatentFolder {
                 samples = range.end;
                 match scenes.last_mut() {
                     // A scene may go on in the next shard.
-                    Some((dataset, scene, last)) if *dataset == run.dataset && *scene == run.scene => last.end = range.end,
+                    Some((dataset, scene, last)) if *dataset == run.dataset && *scene == run.scene => {
+                        last.end = range.end
+                    }
                     _ => scenes.push((run.dataset.clone(), run.scene.clone(), range)),
                 }
             }
@@ -154,9 +157,11 @@ impl SceneDataset for LatentFolder {
     }
 
     fn scene_ranges(&self) -> Vec<Range<usize>> {
-        let own = self.content.scenes.iter().filter(|(_, scene)| {
-            scene.start >= self.range.start && scene.end <= self.range.end
-        });
+        let own = self
+            .content
+            .scenes
+            .iter()
+            .filter(|(_, scene)| scene.start >= self.range.start && scene.end <= self.range.end);
         own.map(|(_, scene)| scene.start - self.range.start..scene.end - self.range.start).collect()
     }
 

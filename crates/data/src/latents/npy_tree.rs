@@ -81,6 +81,15 @@ impl NpyTreeConfig {
 impl NpyLayout {
     const ALL: [Self; 4] = [Self::Tokens, Self::Chw, Self::Hwc, Self::MomentsTokens];
 
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Tokens => "tokens",
+            Self::Chw => "chw",
+            Self::Hwc => "hwc",
+            Self::MomentsTokens => "moments_tokens",
+        }
+    }
+
     /// Shapes of latents `[C, h, w]` in this layout, with the number of channels in the file.
     fn shapes(self, [c, h, w]: [usize; 3]) -> Vec<(Vec<usize>, usize)> {
         match self {
@@ -134,7 +143,8 @@ impl NpyTree {
                 }
             }
             if let (Some(extra), TreeKind::BevLidar) = (files.first(), config.kind) {
-                let what = format!("frame at exactly {extra} of {name} in {}, to which a latent belongs", dataset.name());
+                let what =
+                    format!("frame at exactly {extra} of {name} in {}, to which a latent belongs", dataset.name());
                 return Err(DataError::Missing { what, path: config.file(&name, *extra) });
             }
         }
@@ -170,7 +180,9 @@ impl NpyTree {
 /// Instants of the files of a log.
 fn listed(folder: &Path) -> Result<BTreeSet<i64>, DataError> {
     let entries = std::fs::read_dir(folder).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => DataError::Missing { what: "folder of a log's latents".into(), path: folder.into() },
+        std::io::ErrorKind::NotFound => {
+            DataError::Missing { what: "folder of a log's latents".into(), path: folder.into() }
+        }
         _ => DataError::Io { action: "list", source, path: folder.into() },
     })?;
     let mut found = BTreeSet::new();
@@ -220,7 +232,7 @@ fn parse(bytes: &[u8], path: &Path, shape: [usize; 3], declared: Option<NpyLayou
             }
         }
     }
-    let names = fitting.iter().map(|(layout, ..)| format!("{layout:?}").to_lowercase()).collect::<Vec<_>>();
+    let names = fitting.iter().map(|(layout, ..)| layout.name()).collect::<Vec<_>>();
     match (fitting.pop(), fitting.is_empty(), refusal) {
         (Some((layout, channels, array)), true, _) => {
             let values: Vec<f32> = array.to_f64().into_iter().map(|value| value as f32).collect();
@@ -266,7 +278,9 @@ impl SceneDataset for NpyTree {
         let mut ranges: Vec<Range<usize>> = Vec::new();
         for (at, (_, scene, _)) in self.frames.iter().enumerate() {
             match ranges.last_mut() {
-                Some(last) if self.frames.get(last.start).is_some_and(|(_, first, _)| first == scene) => last.end = at + 1,
+                Some(last) if self.frames.get(last.start).is_some_and(|(_, first, _)| first == scene) => {
+                    last.end = at + 1
+                }
                 _ => ranges.push(at..at + 1),
             }
         }
@@ -338,7 +352,9 @@ impl NpyTreeWriter {
         let shapes = self.layout.shapes(self.shape);
         let shape = shapes.first().map_or(&[][..], |(shape, _)| shape);
         let bytes = match self.dtype {
-            LatentType::F32 => npy_bytes(Dtype::F32, shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())?,
+            LatentType::F32 => {
+                npy_bytes(Dtype::F32, shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())?
+            }
             LatentType::F16 => {
                 if let Some(value) = values.iter().find(|value| !f16::from_f32(**value).is_finite()) {
                     let why = format!("{value} does not fit half precision; write f32 instead");
@@ -402,7 +418,8 @@ mod tests {
         assert_eq!((first.mean[1], last.mean[1]), (1.0, 4.0));
         let wrong = parse(&bytes, path, [3, 4, 4], None).unwrap_err().to_string();
         assert!(wrong.contains("some.npy") && wrong.contains("4, 4, 4"), "{wrong}");
-        let nan = parse(&file(&[2, 1, 1], &[0.0, f32::NAN]), path, [2, 1, 1], Some(NpyLayout::Chw)).unwrap_err().to_string();
+        let nan =
+            parse(&file(&[2, 1, 1], &[0.0, f32::NAN]), path, [2, 1, 1], Some(NpyLayout::Chw)).unwrap_err().to_string();
         assert!(nan.contains("number 1 is not finite"), "{nan}");
         let whole = npy_bytes(Dtype::I32, &[12, 2], &[0; 96]).unwrap();
         assert!(parse(&whole, path, SHAPE, None).is_err());

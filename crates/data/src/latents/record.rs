@@ -64,11 +64,7 @@ impl StoredBox {
 
     fn object(self) -> ObjectBox {
         ObjectBox {
-            box3d: Box3d {
-                center: DVec3::from_array(self.center),
-                size: DVec3::from_array(self.size),
-                yaw: self.yaw,
-            },
+            box3d: Box3d { center: DVec3::from_array(self.center), size: DVec3::from_array(self.size), yaw: self.yaw },
             class: self.class,
             track: self.track,
             source_class: self.source_class,

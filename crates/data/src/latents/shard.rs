@@ -11,8 +11,8 @@ use safetensors::tensor::{Dtype, Metadata, View, serialize_to_file};
 
 use super::record::Record;
 use super::{Latent, LatentType, json_error, part_of, publish};
-use crate::store::PositionFile;
 use crate::DataError;
+use crate::store::PositionFile;
 
 const MOMENTS: &str = "moments";
 /// Records one after another, UTF-8.
@@ -41,7 +41,8 @@ impl Shard {
     /// Reads the header.
     pub fn open(path: &Path, samples: usize, shape: [usize; 3], dtype: LatentType) -> Result<Self, DataError> {
         let file = PositionFile::open(path)?;
-        let refuse = |why: &str| DataError::Format { format: "latent shard", why: why.to_owned(), path: path.to_owned() };
+        let refuse =
+            |why: &str| DataError::Format { format: "latent shard", why: why.to_owned(), path: path.to_owned() };
         let mut size = [0; 8];
         file.fill(&mut size, 0)?;
         let size = u64::from_le_bytes(size);

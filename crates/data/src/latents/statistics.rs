@@ -65,9 +65,10 @@ impl LatentStatistics {
     /// [`DataError::Missing`], [`DataError::Json`], and [`DataError::Format`] for numbers that no latents have.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let text = std::fs::read_to_string(path).map_err(|source| match source.kind() {
-            std::io::ErrorKind::NotFound => {
-                DataError::Missing { what: "statistics of the latents; run `rigscape encode`".into(), path: path.into() }
-            }
+            std::io::ErrorKind::NotFound => DataError::Missing {
+                what: "statistics of the latents; run `rigscape encode`".into(),
+                path: path.into(),
+            },
             _ => DataError::Io { action: "read", source, path: path.into() },
         })?;
         let read: Self = serde_json::from_str(&text).map_err(json_error(path))?;
@@ -116,7 +117,9 @@ impl LatentStatistics {
     pub fn check_origin(&self, vae_hash: &str, grid: &BevGrid) -> Result<(), String> {
         if self.vae_hash != vae_hash {
             let (made, asked) = (&self.vae_hash, vae_hash);
-            return Err(format!("the latents come from the autoencoder {made}, this one is {asked}; encode again with it"));
+            return Err(format!(
+                "the latents come from the autoencoder {made}, this one is {asked}; encode again with it"
+            ));
         }
         if self.grid != *grid {
             let (made, asked) = (&self.grid, grid);
@@ -217,7 +220,8 @@ impl StatisticsCollector {
 mod tests {
     use super::*;
 
-    const GRID: BevGrid = BevGrid { x_range: [-8.0, 8.0], y_range: [-8.0, 8.0], z_range: [-1.0, 3.0], cells: [4, 8, 8] };
+    const GRID: BevGrid =
+        BevGrid { x_range: [-8.0, 8.0], y_range: [-8.0, 8.0], z_range: [-1.0, 3.0], cells: [4, 8, 8] };
 
     fn measured(posterior: Posterior) -> LatentStatistics {
         let mut collector = StatisticsCollector::new(2, posterior);

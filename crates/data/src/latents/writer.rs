@@ -37,9 +37,8 @@ impl LatentWriter {
             None => {
                 let mut entries = std::fs::read_dir(folder).map_err(crate::staging::io("list", folder))?;
                 // What a run that died before its first shard left behind is ours.
-                let foreign = entries.any(|entry| {
-                    entry.is_ok_and(|entry| !entry.file_name().to_string_lossy().ends_with(".part"))
-                });
+                let foreign = entries
+                    .any(|entry| entry.is_ok_and(|entry| !entry.file_name().to_string_lossy().ends_with(".part")));
                 if foreign {
                     return Err(DataError::Config(format!(
                         "the folder is not empty and holds no {MANIFEST}; choose another one: {}",
@@ -103,9 +102,9 @@ impl LatentWriter {
                 collector.add(&stored.latent(index)?);
             }
             let head = &self.manifest.head;
-            let statistics = collector.finish(&head.vae_hash, &head.datasets.join("+"), &head.grid).map_err(|why| {
-                DataError::Format { format: "set of latents", why, path: self.folder.clone() }
-            })?;
+            let statistics = collector
+                .finish(&head.vae_hash, &head.datasets.join("+"), &head.grid)
+                .map_err(|why| DataError::Format { format: "set of latents", why, path: self.folder.clone() })?;
             statistics.write(&self.folder.join(STATISTICS))?;
             self.manifest.complete = true;
             self.manifest.write(&self.folder)?;
@@ -127,6 +126,6 @@ fn difference(found: &LatentHead, asked: &LatentHead) -> String {
         ("grid", format!("{:?}", found.grid), format!("{:?}", asked.grid)),
     ];
     let differing = pairs.into_iter().find(|(_, found, asked)| found != asked);
-    differing.map_or("other settings".to_owned(), |(name, found, asked)| format!("another {name} ({found}, not {asked})"))
+    differing
+        .map_or("other settings".to_owned(), |(name, found, asked)| format!("another {name} ({found}, not {asked})"))
 }
-

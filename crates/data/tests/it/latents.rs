@@ -112,7 +112,11 @@ fn other_folders_and_damaged_files_are_refused() {
     // A header that promises more than the file has, and one of a gigabyte.
     for change in [b'9', 0xff] {
         let mut bad = bytes.clone();
-        if change == 0xff { bad[3] = change } else { bad[bytes.iter().position(|b| *b == b'4').unwrap()] = change }
+        if change == 0xff {
+            bad[3] = change
+        } else {
+            bad[bytes.iter().position(|b| *b == b'4').unwrap()] = change
+        }
         std::fs::write(&shard, &bad).unwrap();
         let error = LatentFolder::open(root.path()).unwrap_err().to_string();
         assert!(error.contains("shard_00001"), "{error}");
