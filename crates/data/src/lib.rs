@@ -13,6 +13,7 @@ mod error;
 mod frame;
 mod image_source;
 mod jpeg;
+pub mod layout;
 mod lidar;
 mod loader;
 mod local_map;

@@ -6,6 +6,7 @@ mod clips;
 mod colmap;
 mod fuzzed;
 mod generated;
+mod layout;
 mod listed;
 mod loader;
 mod npz;
