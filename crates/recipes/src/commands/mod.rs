@@ -19,7 +19,6 @@ mod train_vae;
 mod training;
 
 pub use check_data::{CheckDataArgs, check_data};
-pub(crate) use check_table::class_name;
 pub use common::{DataArgs, LoadedModel, UsageError, run_main};
 pub use data_source::{Chosen, DataSource, Named};
 pub use encode::{EncodeArgs, encode};

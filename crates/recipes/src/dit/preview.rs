@@ -65,7 +65,7 @@ fn painted_frame(item: &LatentItem, rig: &CameraRig, pictures: Vec<RgbImage>, sc
         timestamp_ns: 0,
         world_from_ego: Rigid::IDENTITY,
         views: rig.cameras.iter().zip(pictures).map(view).collect(),
-        boxes: Some(item.boxes.clone()),
+        boxes: Some(item.layout.annotations()),
         scene_text: None,
     }
 }

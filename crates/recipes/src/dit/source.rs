@@ -5,9 +5,7 @@ use std::sync::Arc;
 use anyhow::ensure;
 use data::latents::{Latent, LatentDataset};
 use data::layout::{Layout, LayoutClasses};
-use data::{
-    FrameId, LoaderConfig, Mixture, MixtureConfig, ObjectBox, Sample, SceneBatch, SceneDataset, SceneFrame, assemble,
-};
+use data::{FrameId, LoaderConfig, Mixture, MixtureConfig, Sample, SceneBatch, SceneDataset, SceneFrame, assemble};
 use rayon::prelude::*;
 use train::{BatchSource, TrainError};
 
@@ -26,8 +24,6 @@ pub struct LatentItem {
     pub latent: Option<Latent>,
     /// What steers it.
     pub layout: Layout,
-    /// The annotated boxes that the layout holds.
-    pub boxes: Vec<ObjectBox>,
 }
 
 /// What a step learns from.
@@ -48,8 +44,7 @@ impl LatentItem {
             frame.id.scene,
             frame.id.dataset
         );
-        let boxes = frame.boxes.iter().flatten().filter(|found| classes.name_of(found).is_some()).cloned().collect();
-        Ok(Self { id: frame.id.clone(), draw, latent, layout: Layout::of_frame(frame, classes), boxes })
+        Ok(Self { id: frame.id.clone(), draw, latent, layout: Layout::of_frame(frame, classes) })
     }
 
     /// The name of its frame in random streams.
