@@ -13,11 +13,8 @@ mod error;
 mod frame;
 mod image_source;
 mod jpeg;
-<<<<<<< HEAD
 pub mod latents;
-=======
 pub mod layout;
->>>>>>> 95ba549888704b953e95777277df5e7bbdf963b4
 mod lidar;
 mod loader;
 mod local_map;

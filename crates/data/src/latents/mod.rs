@@ -6,7 +6,9 @@
 
 mod folder;
 mod manifest;
+mod npy_file;
 mod npy_tree;
+mod npy_writer;
 mod record;
 mod shard;
 mod statistics;
@@ -20,7 +22,9 @@ use crate::{DataError, SceneDataset};
 
 pub use folder::LatentFolder;
 pub use manifest::{LatentHead, MANIFEST};
-pub use npy_tree::{NpyLayout, NpyTree, NpyTreeConfig, NpyTreeWriter, TreeKind};
+pub use npy_file::NpyLayout;
+pub use npy_tree::{NpyTree, NpyTreeConfig, TreeKind};
+pub use npy_writer::NpyTreeWriter;
 pub use statistics::{LatentScale, LatentStatistics, Posterior, STATISTICS, StatisticsCollector};
 pub use writer::LatentWriter;
 

@@ -6,11 +6,8 @@ mod clips;
 mod colmap;
 mod fuzzed;
 mod generated;
-<<<<<<< HEAD
 mod latents;
-=======
 mod layout;
->>>>>>> 95ba549888704b953e95777277df5e7bbdf963b4
 mod listed;
 mod loader;
 mod npz;
