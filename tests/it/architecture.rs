@@ -31,6 +31,7 @@ const ARROWS: [(&str, &[&str]); 14] = [
             "features",
             "vae",
             "stable-diffusion",
+            "dit",
             "metrics",
             "train",
         ],

@@ -8,6 +8,7 @@ use rigscape::autoencoder::AutoencoderExperiment;
 use rigscape::bev_vae::Experiment;
 use rigscape::commands::{CheckDataArgs, Chosen};
 use rigscape::config_file;
+use rigscape::dit::DitExperiment;
 use rigscape::latent_diffusion::UNetExperiment;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -27,7 +28,7 @@ fn files(folder: &Path, found: &mut Vec<PathBuf>) {
 fn shipped_configs_are_read_strictly_and_stay_short() {
     let mut found = Vec::new();
     files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &mut found);
-    assert!(found.len() >= 9, "{found:?}");
+    assert!(found.len() >= 12, "{found:?}");
     for path in found {
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.starts_with('#'), "{}: open with what to expect", path.display());
@@ -41,8 +42,14 @@ fn shipped_configs_are_read_strictly_and_stay_short() {
             assert!(!chosen.datasets.is_empty() && chosen.loader.is_none(), "{}: only datasets", path.display());
             continue;
         }
+        if path.parent().is_some_and(|folder| folder.ends_with("configs/dit")) {
+            read_back(&path, DitExperiment::checked);
+            assert!(!read_as_data(&path).unwrap().datasets.is_empty());
+            continue;
+        }
         match path.file_stem().and_then(|stem| stem.to_str()) {
             Some("autoencoder") => read_back(&path, AutoencoderExperiment::checked),
+            Some("dit") => read_back(&path, DitExperiment::checked),
             Some("unet") => read_back(&path, UNetExperiment::checked),
             _ => read_back::<Experiment>(&path, Ok),
         }

@@ -3,6 +3,7 @@
 mod architecture;
 mod configs;
 mod data_commands;
+mod dit_runs;
 mod evaluate;
 mod latent_runs;
 mod programs;

@@ -144,6 +144,14 @@ pub enum DataError {
         /// The picture.
         path: PathBuf,
     },
+    /// A layout of boxes that cannot be used.
+    #[error("{source}: {}", path.display())]
+    Layout {
+        /// Complaint.
+        source: crate::layout::LayoutError,
+        /// The layout's file.
+        path: PathBuf,
+    },
     /// A name inside a file that would leave the dataset's folder.
     #[error("{text:?} is not a plain relative path inside the dataset: {}", path.display())]
     UnsafePath {

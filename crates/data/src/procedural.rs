@@ -41,6 +41,20 @@ pub enum RigSource {
     Cameras(CameraRig),
 }
 
+impl RigSource {
+    /// The cameras.
+    ///
+    /// # Errors
+    /// A file that is not there or holds no usable cameras.
+    pub fn load(&self) -> Result<CameraRig, DataError> {
+        match self {
+            Self::Preset(preset) => Ok(preset.rig()),
+            Self::File(path) => read_rig(path),
+            Self::Cameras(rig) => Ok(rig.clone()),
+        }
+    }
+}
+
 /// Settings of a [`Procedural`] dataset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -120,11 +134,7 @@ impl Procedural {
         if cells.is_none_or(|cells| cells > MOST_CELLS) {
             return refuse(format!("occupancy has more than {MOST_CELLS} cells"));
         }
-        let mut rig = match &config.rig {
-            RigSource::Preset(preset) => preset.rig(),
-            RigSource::File(path) => read_rig(path)?,
-            RigSource::Cameras(rig) => rig.clone(),
-        };
+        let mut rig = config.rig.load()?;
         if let Some(unknown) = config.cameras.iter().find(|name| rig.cameras.iter().all(|c| c.channel != **name)) {
             let known: Vec<&str> = rig.cameras.iter().map(|c| c.channel.as_str()).collect();
             return refuse(format!("the rig has no camera {unknown:?}, only {}", known.join(", ")));

@@ -19,6 +19,18 @@ pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     std::fs::write(path, bytes).map_err(io("write", path))
 }
 
+/// Writes a whole file under a temporary name beside its own, then renames it, so that no reader meets half a file.
+pub(crate) fn write_renamed(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+    if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        create_dir(parent)?;
+    }
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    write(&part, bytes)?;
+    std::fs::rename(&part, path).map_err(io("write", path))
+}
+
 /// Makes a folder and those above it.
 pub(crate) fn create_dir(path: &Path) -> Result<(), DataError> {
     std::fs::create_dir_all(path).map_err(io("make the folder", path))

@@ -21,6 +21,7 @@ pub use roots::{Root, Roots};
 
 use file::{Place, missing};
 use mount::Mount;
+pub(crate) use positional::PositionFile;
 
 use crate::DataError;
 

@@ -44,6 +44,25 @@ impl ObjectClass {
     pub const fn index(self) -> usize {
         self as usize
     }
+
+    /// The name in files, configs and layouts.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Car => "car",
+            Self::Truck => "truck",
+            Self::Bus => "bus",
+            Self::Trailer => "trailer",
+            Self::ConstructionVehicle => "construction_vehicle",
+            Self::Motorcycle => "motorcycle",
+            Self::Bicycle => "bicycle",
+            Self::Pedestrian => "pedestrian",
+            Self::TrafficCone => "traffic_cone",
+            Self::Barrier => "barrier",
+            Self::Sign => "sign",
+            Self::Animal => "animal",
+            Self::Other => "other",
+        }
+    }
 }
 
 /// What to do with a native class, where a config overrides the tables below.
@@ -107,6 +126,28 @@ pub fn from_argoverse2(category: &str) -> Option<ObjectClass> {
     })
 }
 
+/// The Argoverse 2 category nearest to a shared class; `None` for [`ObjectClass::Other`].
+///
+/// Construction vehicles become `LARGE_VEHICLE` and barriers `BOLLARD`, which read back as truck and other: nothing is nearer.
+pub const fn nearest_argoverse2(class: ObjectClass) -> Option<&'static str> {
+    use ObjectClass::*;
+    Some(match class {
+        Car => "REGULAR_VEHICLE",
+        Truck => "TRUCK",
+        Bus => "BUS",
+        Trailer => "VEHICULAR_TRAILER",
+        ConstructionVehicle => "LARGE_VEHICLE",
+        Motorcycle => "MOTORCYCLE",
+        Bicycle => "BICYCLE",
+        Pedestrian => "PEDESTRIAN",
+        TrafficCone => "CONSTRUCTION_CONE",
+        Barrier => "BOLLARD",
+        Sign => "SIGN",
+        Animal => "ANIMAL",
+        Other => return None,
+    })
+}
+
 /// The shared class of a nuPlan category; `None` for a name the taxonomy has no rule for. `vehicle` is every motor vehicle.
 pub fn from_nuplan(category: &str) -> Option<ObjectClass> {
     use ObjectClass::*;
@@ -165,6 +206,7 @@ mod tests {
             "barrier",
         ];
         assert_eq!(names[..10], official.map(serde_json::Value::from));
+        assert_eq!(names, ObjectClass::ALL.map(|class| serde_json::Value::from(class.name())));
         assert!(ObjectClass::ALL.iter().enumerate().all(|(at, class)| class.index() == at));
     }
 

@@ -69,6 +69,7 @@ pub enum Preset {
     /// 12 blocks of width 384.
     S,
     /// 12 blocks of width 768, the width of the BEV-VAE paper.
+    #[serde(alias = "paper")]
     B,
     /// 24 blocks of width 1024.
     L,

@@ -96,18 +96,38 @@ impl Dit {
     /// If shapes or the kind of condition disagree with the config.
     pub fn forward(&self, x: Tensor<4>, timesteps: &[f64], condition: &Condition<'_>) -> Tensor<4> {
         let device = x.device();
-        let [b, c, rows, columns] = x.dims();
-        let expected = (self.config.latent_channels, self.config.latent_size);
-        assert_eq!((c, [rows, columns]), expected, "latent channels and cells");
-        assert_eq!(timesteps.len(), b, "one timestep per sample");
-        let [h, w] = self.config.token_grid();
-        let d = self.config.width;
-        let code: Vec<f32> = position_code([h, w], d).into_iter().map(|v| v as f32).collect();
-        let code = Tensor::<3>::from_data(TensorData::new(code, [1, h * w, d]), &device);
-        let tokens = self.patch.forward(x).reshape([b, h * w, d]) + code;
+        assert_eq!(timesteps.len(), x.dims()[0], "one timestep per sample");
+        let tokens = self.tokens(x);
         let (tokens, c) = self.steer(tokens, self.timestep.forward(timesteps, &device), condition);
         let tokens = self.blocks.iter().fold(tokens, |tokens, block| block.forward(tokens, c.clone()));
         self.unpatched(tokens, c)
+    }
+
+    /// Norm of the layout's vectors over that of the tokens they are added to, `[1]`: whether the condition is alive. `None` for a network
+    /// without layouts.
+    ///
+    /// # Shapes
+    /// - x: `[B, C, H, W]`
+    /// - occupancy: `[B, K, Z, p·h, p·w]`
+    ///
+    /// # Panics
+    /// If shapes disagree with the config.
+    pub fn layout_share(&self, x: Tensor<4>, occupancy: Tensor<5>) -> Option<Tensor<1>> {
+        let norm = |vectors: Tensor<3>| vectors.square().sum().sqrt();
+        let layout = self.layout.as_ref()?;
+        Some(norm(layout.forward(occupancy)) / norm(self.tokens(x)))
+    }
+
+    /// Cells with their place, `[B, N, D]`.
+    fn tokens(&self, x: Tensor<4>) -> Tensor<3> {
+        let [b, c, rows, columns] = x.dims();
+        let expected = (self.config.latent_channels, self.config.latent_size);
+        assert_eq!((c, [rows, columns]), expected, "latent channels and cells");
+        let [h, w] = self.config.token_grid();
+        let d = self.config.width;
+        let code: Vec<f32> = position_code([h, w], d).into_iter().map(|v| v as f32).collect();
+        let code = Tensor::<3>::from_data(TensorData::new(code, [1, h * w, d]), &x.device());
+        self.patch.forward(x).reshape([b, h * w, d]) + code
     }
 
     /// Adds the condition to the tokens or to the time vector.

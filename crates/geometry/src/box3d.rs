@@ -3,7 +3,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::{Rigid, wrap_angle};
+use crate::{OrientedBox, Rigid, wrap_angle};
 
 /// An upright oriented box, usually in the ego frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -20,18 +20,7 @@ impl Box3d {
     /// The eight corners in nuScenes `Box.corners` order: signs of (l/2, w/2, h/2)
     /// (+,+,+) (+,-,+) (+,-,-) (+,+,-) (-,+,+) (-,-,+) (-,-,-) (-,+,-).
     pub fn corners(&self) -> [DVec3; 8] {
-        const SIGNS: [[f64; 3]; 8] = [
-            [1.0, 1.0, 1.0],
-            [1.0, -1.0, 1.0],
-            [1.0, -1.0, -1.0],
-            [1.0, 1.0, -1.0],
-            [-1.0, 1.0, 1.0],
-            [-1.0, -1.0, 1.0],
-            [-1.0, -1.0, -1.0],
-            [-1.0, 1.0, -1.0],
-        ];
-        let dst_from_box = Rigid::from_yaw(self.yaw, self.center);
-        SIGNS.map(|s| dst_from_box * (DVec3::from_array(s) * self.size * 0.5))
+        OrientedBox::from(*self).corners()
     }
 
     /// The same box in another frame; the tilt of `dst_from_src` turns the centre, only its yaw turns the heading.

@@ -92,7 +92,7 @@ pub enum DecayScope {
     /// Tensors of rank 2 and more (matrices and convolutions, no gains or biases) whose last path part contains none
     /// of the `except` texts.
     Matrices {
-        /// Parts of names that do not decay although they are tables, such as learned queries.
+        /// Parts of names that do not decay although they are tables, such as learned queries and place codes.
         except: Vec<String>,
     },
     /// Every parameter.
@@ -101,7 +101,7 @@ pub enum DecayScope {
 
 impl Default for DecayScope {
     fn default() -> Self {
-        Self::Matrices { except: ["query", "queries", "embedding"].map(String::from).to_vec() }
+        Self::Matrices { except: ["query", "queries", "embedding", "code"].map(String::from).to_vec() }
     }
 }
 
@@ -294,6 +294,7 @@ mod tests {
         assert!(covers("query.weight", &[4, 4]));
         assert!(!covers("blocks.0.norm.gain", &[4]));
         assert!(!covers("scene.pillar_queries", &[16, 4]));
+        assert!(!covers("layout.slice_code", &[4, 24]));
         let all = DecayScope::All;
         assert!(all.covers(&ParamInfo { path: "b".into(), shape: vec![3], id: ParamId::new() }));
     }

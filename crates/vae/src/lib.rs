@@ -17,4 +17,4 @@ pub use config::{BevVaeConfig, ConfigError, ImageConfig, Preset, SceneConfig, St
 pub use discriminator::Discriminator;
 pub use model::{BevVae, Decoded, Decoder, Encoder};
 pub use sample_points::{SamplePoints, ViewMatrices};
-pub use state_coder::DiagonalGaussian;
+pub use state_coder::{DiagonalGaussian, latent_picture, latent_tokens};

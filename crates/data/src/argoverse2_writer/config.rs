@@ -90,7 +90,7 @@ impl Argoverse2WriterConfig {
     /// The category a box is written with: its own if the layout has it, else the rule of its class, else the nearest category. `None`
     /// for a box that is left out.
     ///
-    /// Construction vehicles become `LARGE_VEHICLE` and barriers `BOLLARD`, which read back as truck and other: the layout has nothing nearer.
+    /// The nearest categories are those of [`taxonomy::nearest_argoverse2`].
     ///
     /// # Errors
     /// [`DataError::UnknownClass`] for class `Other` without a rule.
@@ -101,22 +101,10 @@ impl Argoverse2WriterConfig {
         let nearest = match (self.categories.get(&class), class) {
             (Some(CategoryRule::Drop), _) => return Ok(None),
             (Some(CategoryRule::As(category)), _) => category,
-            (None, ObjectClass::Car) => "REGULAR_VEHICLE",
-            (None, ObjectClass::Truck) => "TRUCK",
-            (None, ObjectClass::Bus) => "BUS",
-            (None, ObjectClass::Trailer) => "VEHICULAR_TRAILER",
-            (None, ObjectClass::ConstructionVehicle) => "LARGE_VEHICLE",
-            (None, ObjectClass::Motorcycle) => "MOTORCYCLE",
-            (None, ObjectClass::Bicycle) => "BICYCLE",
-            (None, ObjectClass::Pedestrian) => "PEDESTRIAN",
-            (None, ObjectClass::TrafficCone) => "CONSTRUCTION_CONE",
-            (None, ObjectClass::Barrier) => "BOLLARD",
-            (None, ObjectClass::Sign) => "SIGN",
-            (None, ObjectClass::Animal) => "ANIMAL",
-            (None, ObjectClass::Other) => {
-                let dataset = "the argoverse2 writer (`categories`)".to_owned();
-                return Err(DataError::UnknownClass { dataset, name: source_class.to_owned() });
-            }
+            (None, class) => taxonomy::nearest_argoverse2(class).ok_or_else(|| DataError::UnknownClass {
+                dataset: "the argoverse2 writer (`categories`)".to_owned(),
+                name: source_class.to_owned(),
+            })?,
         };
         Ok(Some(nearest))
     }

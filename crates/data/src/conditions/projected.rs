@@ -8,9 +8,18 @@ const NEAR_M: f64 = 0.1;
 
 /// Pairs of corners in the order of [`Box3d::corners`].
 const EDGES: [[usize; 2]; 12] = [
-    [0, 1], [1, 2], [2, 3], [3, 0], // front
-    [4, 5], [5, 6], [6, 7], [7, 4], // back
-    [0, 4], [1, 5], [2, 6], [3, 7],
+    [0, 1],
+    [1, 2],
+    [2, 3],
+    [3, 0], // front
+    [4, 5],
+    [5, 6],
+    [6, 7],
+    [7, 4], // back
+    [0, 4],
+    [1, 5],
+    [2, 6],
+    [3, 7],
 ];
 
 /// The points whose hull is the picture of a box: its corners, cut along its edges at 0.1 m before the camera. None for a box behind it.

@@ -9,7 +9,7 @@ use crate::DataError;
 
 /// An open file that many threads read at once.
 #[derive(Debug)]
-pub(super) struct PositionFile {
+pub(crate) struct PositionFile {
     file: File,
     /// Bytes when it was opened.
     pub len: u64,

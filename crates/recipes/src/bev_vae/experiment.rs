@@ -57,12 +57,14 @@ fn runs() -> PathBuf {
 }
 
 /// Datasets and how they are mixed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DataConfig {
     /// Training datasets; their rigs may differ.
+    #[serde(default)]
     pub train: Vec<DatasetConfig>,
     /// Held-out datasets.
+    #[serde(default)]
     pub validation: Vec<DatasetConfig>,
     /// Weights and order of the training datasets.
     #[serde(default)]

@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs, ShowDataArgs,
-    check_data, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
+    CheckDataArgs, EncodeArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs,
+    ShowDataArgs, check_data, encode, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -21,6 +21,7 @@ enum Command {
     MakeData(MakeDataArgs),
     CheckData(CheckDataArgs),
     ShowData(ShowDataArgs),
+    Encode(Box<EncodeArgs>),
     Evaluate(Box<EvaluateArgs>),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
@@ -34,6 +35,7 @@ fn main() -> ExitCode {
         Command::MakeData(args) => make_data(args),
         Command::CheckData(args) => check_data(args),
         Command::ShowData(args) => show_data(args),
+        Command::Encode(args) => encode(args),
         Command::Evaluate(args) => evaluate(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),

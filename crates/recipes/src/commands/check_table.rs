@@ -70,8 +70,7 @@ fn boxes(report: &CheckReport) -> String {
     }
     let mut classes: Vec<_> = boxes.by_class.iter().collect();
     classes.sort_by_key(|(class, count)| (std::cmp::Reverse(**count), **class));
-    let classes: Vec<String> =
-        classes.iter().map(|(class, count)| format!("{} {count}", class_name(**class))).collect();
+    let classes: Vec<String> = classes.iter().map(|(class, count)| format!("{} {count}", class.name())).collect();
     format!(
         "{} in {}; {} interpolated, {} in no picture{}{}",
         boxes.count,
@@ -81,11 +80,6 @@ fn boxes(report: &CheckReport) -> String {
         if classes.is_empty() { "" } else { "\n               " },
         classes.join(", ")
     )
-}
-
-/// The class as configs write it.
-pub(crate) fn class_name(class: data::ObjectClass) -> String {
-    serde_json::to_value(class).ok().and_then(|value| Some(value.as_str()?.to_owned())).unwrap_or_default()
 }
 
 fn parts(report: &CheckReport) -> String {

@@ -10,6 +10,7 @@ use toml::{Table, Value};
 use super::common::{DataArgs, UsageError};
 use crate::bev_vae::{DataConfig, Experiment};
 use crate::config_file;
+use crate::dit::DitExperiment;
 
 /// Datasets of a file, or one dataset named by options.
 #[derive(Debug, Clone, Args)]
@@ -106,6 +107,10 @@ fn read_file(path: &Path, overrides: &[String]) -> anyhow::Result<Chosen> {
         }
         Some(Value::Array(_)) if !is_experiment => {
             Ok(Chosen { datasets: list("data", config_file::load::<ListFile>(path, overrides)?.data), loader: None })
+        }
+        _ if shape.contains_key("latents") => {
+            let experiment: DitExperiment = config_file::load(path, overrides)?;
+            Ok(Chosen { datasets: splits(experiment.data), loader: None })
         }
         _ => {
             let experiment: Experiment = config_file::load(path, overrides)?;

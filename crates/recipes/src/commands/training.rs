@@ -6,10 +6,12 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use burn::tensor::Device;
 use clap::Args;
-use data::{LoaderConfig, Mixture, SceneBatch, SceneDataset};
+use data::{DatasetConfig, LoaderConfig, Mixture, SceneBatch, SceneDataset};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use train::{DeviceConfig, Interrupt, OnExisting, Outcome, RunDir, RunSetup, Task, TrainConfig};
+use train::{
+    BatchSource, DeviceConfig, Interrupt, OnExisting, Outcome, RunDir, RunSetup, Task, TrainConfig, TrainError,
+};
 
 use super::common::{open_all, say};
 use crate::LoaderSource;
@@ -48,16 +50,21 @@ pub(super) trait TrainExperiment: Serialize + DeserializeOwned {
     fn train(&self) -> &TrainConfig;
     fn loader(&self) -> LoaderConfig;
 
+    /// Whether every run reads its datasets; one that may have all it needs from elsewhere opens them itself.
+    const READS_DATASETS: bool = true;
+
     /// The experiment, if its settings go together.
     fn checked(self) -> anyhow::Result<Self> {
         Ok(self)
     }
 }
 
-/// Implements [`TrainExperiment`] for an experiment whose fields have the usual names; the second form checks it too.
+/// Implements [`TrainExperiment`] for an experiment whose fields have the usual names; the second form checks it too, the third also
+/// leaves the datasets closed.
 macro_rules! train_experiment {
-    ($type:ty $(, $checked:ident)?) => {
+    ($type:ty $(, $checked:ident $(, $reads:literal)?)?) => {
         impl $crate::commands::training::TrainExperiment for $type {
+            $($(const READS_DATASETS: bool = $reads;)?)?
             fn seed(&self) -> u64 {
                 self.seed
             }
@@ -114,13 +121,17 @@ pub(super) fn print_config<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Resu
 /// Reads the experiment, opens device and data, and makes the run's folder.
 pub(super) fn prepare<E: TrainExperiment>(args: &TrainArgs) -> anyhow::Result<Prepared<E>> {
     let mut experiment: E = read(args)?;
-    if experiment.data().train.is_empty() || experiment.data().validation.is_empty() {
+    let data = experiment.data();
+    if E::READS_DATASETS && (data.train.is_empty() || data.validation.is_empty()) {
         bail!("data.train and data.validation need at least one dataset each: {}", args.config.display());
     }
     let interrupt = Interrupt::listen()?;
     let device = experiment.device().open()?;
-    let training = open_all(&experiment.data().train).context("in data.train")?;
-    let validation = open_all(&experiment.data().validation).context("in data.validation")?;
+    let open = |place: &str, configs: &[DatasetConfig]| -> anyhow::Result<Vec<Arc<dyn SceneDataset>>> {
+        if E::READS_DATASETS { open_all(configs).with_context(|| format!("in {place}")) } else { Ok(Vec::new()) }
+    };
+    let training = open("data.train", &experiment.data().train)?;
+    let validation = open("data.validation", &experiment.data().validation)?;
     let text = toml::to_string(&experiment).context("cannot write the resolved config")?;
     let on_existing = if args.resume { OnExisting::Resume } else { OnExisting::NextFreeName };
     let run_dir = RunDir::create(&experiment.run().root, &experiment.run().name, on_existing)?;
@@ -135,16 +146,26 @@ impl<E: TrainExperiment> Prepared<E> {
         let (loader, seed) = (self.experiment.loader(), self.experiment.seed());
         let mixture = &self.experiment.data().mixture;
         let mixture = Arc::new(Mixture::new(self.training.clone(), mixture, loader.batch_size, seed)?);
+        self.train_from(task, |position| LoaderSource::open(mixture, loader, position), args)
+    }
+
+    /// The same on batches of any kind.
+    pub fn train_from<T: Task, S: BatchSource<Batch = T::Batch>>(
+        &self,
+        task: &mut T,
+        open_source: impl FnOnce(u64) -> Result<S, TrainError>,
+        args: &TrainArgs,
+    ) -> anyhow::Result<Outcome> {
         let setup = RunSetup {
             config: self.experiment.train(),
             run_dir: &self.run_dir,
-            seed,
+            seed: self.experiment.seed(),
             config_text: &self.text,
             resume: args.resume,
             interrupt: self.interrupt.clone(),
             pause_after: args.stop_after,
         };
-        Ok(train::train(task, |position| LoaderSource::open(mixture, loader, position), &setup)?)
+        Ok(train::train(task, open_source, &setup)?)
     }
 }
 

@@ -7,7 +7,6 @@ use geometry::glam::DVec2;
 
 use super::canvas::{Canvas, Color, line_height, text_width};
 use super::{PageContent, colors};
-use crate::commands::class_name;
 
 /// One line of the strip: entries with a coloured square, or plain text.
 type Entry = (Option<Color>, String);
@@ -55,7 +54,7 @@ fn class_entries(content: &PageContent) -> Vec<Entry> {
     }
     counts
         .into_iter()
-        .map(|(class, count)| (Some(colors::of_class(class)), format!("{} {count}", class_name(class))))
+        .map(|(class, count)| (Some(colors::of_class(class)), format!("{} {count}", class.name())))
         .collect()
 }
 
