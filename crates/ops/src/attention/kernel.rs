@@ -1,5 +1,7 @@
 //! Attention over `[B, H, N, D]` tensors.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Bool, Tensor};
 use rayon::prelude::*;
 
@@ -88,7 +90,7 @@ impl Kernel<3> for Attention {
         out
     }
 
-    fn backward(&self, inputs: [&[f32]; 3], upstream: &[f32], _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
+    fn backward(&self, inputs: [&[f32]; 3], upstream: Cow<'_, [f32]>, _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
         let ([b, h], [n, keys, d, e]) = (self.heads, self.sizes);
         let [part, parts] = self.parts();
         let mut gradients = [b * h * n * d, b * h * keys * d, b * h * keys * e].map(|length| vec![0.0; length]);

@@ -6,28 +6,28 @@
 
 /// Defines a function whose body is compiled for AVX-512, AVX2 and the portable baseline.
 ///
-/// `vectorized! { fn name[const C: usize](x: &[f32]) -> f32 { … } }`; the brackets hold const parameters and may be empty.
+/// `vectorized! { fn name[const C: usize](x: &[f32]) -> f32 { … } }`; the brackets hold a lifetime or const parameters and may be empty.
 macro_rules! vectorized {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident[$(const $param:ident: usize),*]($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?
+    ($(#[$meta:meta])* $vis:vis fn $name:ident[$($life:lifetime)? $(const $param:ident: usize),*]($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?
      $body:block) => {
         $(#[$meta])*
         #[allow(unsafe_code)]
         #[allow(clippy::too_many_arguments)]
-        $vis fn $name<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+        $vis fn $name<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
             #[inline(always)]
             #[allow(clippy::too_many_arguments)]
-            fn body<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? $body
+            fn body<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? $body
 
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx2<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+                fn avx2<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
                     body::<$($param),*>($($arg),*)
                 }
                 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx512<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+                fn avx512<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
                     body::<$($param),*>($($arg),*)
                 }
                 if $crate::fused::has_avx512() {
@@ -87,6 +87,19 @@ fn reduce(a: &[f32], b: &[f32], term: impl Fn(f32, f32) -> f32) -> f32 {
     }
     let [a, b, c, d, e, f, g, h] = lanes;
     ((a + e) + (b + f)) + ((c + g) + (d + h))
+}
+
+/// The largest element; NaN is passed over, and without any other element the result is -∞.
+#[inline(always)]
+pub(crate) fn largest(a: &[f32]) -> f32 {
+    let (long, rest) = a.as_chunks::<LANES>();
+    let mut lanes = [f32::NEG_INFINITY; LANES];
+    for block in long {
+        for i in 0..LANES {
+            lanes[i] = if block[i] > lanes[i] { block[i] } else { lanes[i] };
+        }
+    }
+    rest.iter().chain(&lanes).fold(f32::NEG_INFINITY, |largest, &x| if x > largest { x } else { largest })
 }
 
 /// Sum of `a`.
@@ -157,6 +170,7 @@ mod tests {
             assert_eq!(sum(&a), expected as f32);
             let expected: usize = (0..length).map(|i| i * i).sum();
             assert_eq!(sum_of_products(&a, &a), expected as f32);
+            assert_eq!(largest(&a), a.last().copied().unwrap_or(f32::NEG_INFINITY));
         }
     }
 }
