@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use burn::tensor::{Tensor, activation};
 use rayon::prelude::*;
 
-use crate::fused::{Blank, Kernel, exp_difference, fused_1, on_flex, vectorized, write_1, written};
+use crate::fused::{Blank, Kernel, exp_difference, fused_1, on_flex, vectorized, write_each, written};
 
 /// Exact GELU, `x / 2 · (1 + erf(x / √2))`, elementwise.
 ///
@@ -100,7 +100,7 @@ impl Kernel<1> for Activation {
 
 vectorized! {
     fn gelu_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
-        write_1(y, x, |x| x * normal(x).0)
+        write_each!(y, x in x => x * normal(x).0)
     }
 }
 
@@ -115,7 +115,7 @@ vectorized! {
 
 vectorized! {
     fn gelu_tanh_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
-        write_1(y, x, |x| x * sigmoid(TWICE_SLOPE * (x + CUBIC * x * x * x)))
+        write_each!(y, x in x => x * sigmoid(TWICE_SLOPE * (x + CUBIC * x * x * x)))
     }
 }
 
@@ -131,7 +131,7 @@ vectorized! {
 
 vectorized! {
     fn silu_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
-        write_1(y, x, |x| x * sigmoid(x))
+        write_each!(y, x in x => x * sigmoid(x))
     }
 }
 
@@ -166,10 +166,10 @@ fn normal(x: f32) -> (f32, f32) {
     // z² to more digits than one f32: the upper half of the mantissa squares exactly, the rest is a small correction.
     let coarse = f32::from_bits(z.to_bits() & 0xffff_f000);
     let exponential = exp_difference(-0.5 * coarse * coarse, 0.5 * (z - coarse) * (z + coarse));
-    let t = 1.0 / (1.0 + 0.35 * z);
+    let t = 1.0 / z.mul_add(0.35, 1.0);
     let mut p = TAIL[0];
     for &coefficient in &TAIL[1..] {
-        p = p * t + coefficient;
+        p = p.mul_add(t, coefficient);
     }
     let tail = exponential * (p * t);
     (if x < 0.0 { tail } else { 1.0 - tail }, PEAK * exponential)

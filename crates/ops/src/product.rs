@@ -1,6 +1,6 @@
 //! Matrix products of slices: a bounds-checked face of the crate `gemm`, which reaches the machine's peak on one core and takes any strides.
 
-use crate::fused::{Blank, write_1};
+use crate::fused::{Blank, write_each};
 
 /// A matrix inside a slice; element (i, j) is `data[i·row_stride + j·column_stride]`.
 #[derive(Debug, Clone, Copy)]
@@ -93,16 +93,12 @@ pub(crate) fn product(out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f
 }
 
 /// As [`product`], on the threads named.
-pub(crate) fn product_on(
-    threads: Threads,
-    out: MatrixMut<'_>,
-    a: Matrix<'_>,
-    b: Matrix<'_>,
-    scale: f32,
-    old: Old,
-) {
+pub(crate) fn product_on(threads: Threads, out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f32, old: Old) {
     check_inputs([out.rows, out.columns], a, b);
-    assert!(extent(out.rows, out.columns, out.row_stride, out.column_stride) <= out.data.len(), "result leaves its slice");
+    assert!(
+        extent(out.rows, out.columns, out.row_stride, out.column_stride) <= out.data.len(),
+        "result leaves its slice"
+    );
     let (m, n) = (out.rows, out.columns);
     let (long, short, inner) = if out.row_stride >= out.column_stride {
         (out.row_stride, out.column_stride, n)
@@ -127,7 +123,7 @@ pub(crate) fn product_into<'a>(threads: Threads, out: &'a mut Blank, a: Matrix<'
     check_inputs([m, n], a, b);
     assert_eq!(out.len(), m * n, "size of the result");
     if a.columns == 0 {
-        return write_1(out, &vec![0.0; m * n], |x| x);
+        return write_each!(out, zero in &vec![0.0; m * n] => zero);
     }
     #[allow(unsafe_code)]
     // SAFETY: as in `product_on`; the result is as large as `out` and its old values are never read, so that all of `out` is written.

@@ -98,7 +98,7 @@ impl Kernel<1> for Resize {
         written(self.shape.iter().product(), area, |i, y| {
             let x = &x[i * plane..][..plane];
             let mut row = vec![0.0; self.source[1]];
-            write_rows(y, self.shape[3], |at, y| {
+            write_rows!(y, self.shape[3], (at, y) => {
                 self.mix_rows(x, at, &mut row);
                 for (i, y) in y.iter_mut().enumerate() {
                     let (lower, upper) = (row[self.axes[1].lower[i]], row[self.axes[1].upper[i]]);
@@ -176,7 +176,8 @@ mod tests {
 
     #[test]
     fn kernel_equals_the_composition() {
-        for (source, size) in [([5, 7], [9, 3]), ([1, 1], [4, 2]), ([6, 8], [6, 5]), ([4, 4], [8, 8]), ([9, 2], [1, 1])] {
+        for (source, size) in [([5, 7], [9, 3]), ([1, 1], [4, 2]), ([6, 8], [6, 5]), ([4, 4], [8, 8]), ([9, 2], [1, 1])]
+        {
             for centres in [PixelCentres::Half, PixelCentres::Corner] {
                 let x = pictures([2, 3, source[0], source[1]]).require_grad();
                 let upstream = pictures([2, 3, size[0], size[1]]);
@@ -205,7 +206,8 @@ mod tests {
             let mut bump = vec![0.0; 12];
             bump[i] = 0.5;
             let bump = Tensor::from_data(TensorData::new(bump, [1, 1, 3, 4]), &x.device());
-            let slope = loss(x.clone() + bump.clone()).into_scalar::<f32>() - loss(x.clone() - bump).into_scalar::<f32>();
+            let slope =
+                loss(x.clone() + bump.clone()).into_scalar::<f32>() - loss(x.clone() - bump).into_scalar::<f32>();
             assert!((exact - slope).abs() < 1e-4, "{i}: {exact} against {slope}");
         }
     }

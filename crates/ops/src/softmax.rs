@@ -6,7 +6,8 @@ use burn::tensor::{Tensor, activation};
 use rayon::prelude::*;
 
 use crate::fused::{
-    Blank, Kernel, exp_difference, fused_1, largest, on_flex, sum, sum_of_products, vectorized, write_1, write_rows, written,
+    Blank, Kernel, exp_difference, fused_1, largest, on_flex, sum, sum_of_products, vectorized, write_each, write_rows,
+    written,
 };
 
 /// Softmax over the last axis: `exp(x - max) / Σ exp(x - max)`.
@@ -60,7 +61,7 @@ impl Kernel<1> for Softmax {
 #[inline(always)]
 fn probabilities<'a>(x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
     let largest = largest(x);
-    let y = write_1(y, x, |x| exp_difference(x - largest, 0.0));
+    let y = write_each!(y, x in x => exp_difference(x - largest, 0.0));
     let scale = 1.0 / sum(y);
     for y in y.iter_mut() {
         *y *= scale;
@@ -70,7 +71,7 @@ fn probabilities<'a>(x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
 
 vectorized! {
     fn forward_rows['a](x: &[f32], width: usize, y: &'a mut Blank) -> &'a mut [f32] {
-        write_rows(y, width, |i, y| probabilities(&x[i * width..][..width], y))
+        write_rows!(y, width, (i, y) => probabilities(&x[i * width..][..width], y))
     }
 }
 

@@ -167,7 +167,8 @@ impl Kernel<3> for PackedAttention {
 
     fn backward(&self, inputs: [&[f32]; 3], upstream: Cow<'_, [f32]>, _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
         let heads = 0..self.batch * self.heads;
-        let heads: Vec<Gradients> = heads.into_par_iter().map(|at| self.head_gradients(inputs, &upstream, at)).collect();
+        let heads: Vec<Gradients> =
+            heads.into_par_iter().map(|at| self.head_gradients(inputs, &upstream, at)).collect();
         let gain = |i: usize| {
             let mut total = vec![0.0; self.width];
             for head in &heads {

@@ -7,7 +7,9 @@ use std::borrow::Cow;
 
 use rayon::prelude::*;
 
-use super::layout::{from_tap_rows, flipped_tap_rows, padded_channels_last, spread_channels_last, store, to_scratch, to_tap_rows};
+use super::layout::{
+    flipped_tap_rows, from_tap_rows, padded_channels_last, spread_channels_last, store, to_scratch, to_tap_rows,
+};
 use super::window::Window;
 use crate::fused::{Blank, Kernel};
 use crate::linear::column_sums;

@@ -139,7 +139,11 @@ mod tests {
         for cells in [1, 7, 20, 35] {
             let runs = window.runs(cells);
             assert!(runs.iter().all(|[first, last]| first / 5 == (last - 1) / 5), "{runs:?}");
-            assert!(runs.windows(2).all(|pair| pair[0][1] == pair[1][0]) && runs[0][0] == 0 && runs[runs.len() - 1][1] == 15);
+            assert!(
+                runs.windows(2).all(|pair| pair[0][1] == pair[1][0])
+                    && runs[0][0] == 0
+                    && runs[runs.len() - 1][1] == 15
+            );
         }
     }
 

@@ -9,7 +9,7 @@ pub(crate) type Blank = [MaybeUninit<f32>];
 
 /// A vector of `length` numbers, written in pieces of `piece` on all threads.
 ///
-/// `fill(i, blank)` writes piece `i` and returns it, which only writing can bring about: see [`write_1`] and its like.
+/// `fill(i, blank)` writes piece `i` and returns it, which only writing can bring about: see [`write_each`] and [`write_rows`].
 ///
 /// # Panics
 /// If `fill` returns other memory than its piece.
@@ -39,26 +39,6 @@ pub(crate) fn written_in_parts(
     memory.into_vec()
 }
 
-/// Writes `out` row by row; `row(i, blank)` writes row `i` and returns it.
-///
-/// # Panics
-/// If `row` returns other memory than its row.
-#[inline(always)]
-pub(crate) fn write_rows<'a>(
-    out: &'a mut Blank,
-    width: usize,
-    mut row: impl for<'b> FnMut(usize, &'b mut Blank) -> &'b mut [f32],
-) -> &'a mut [f32] {
-    for (i, blank) in out.chunks_mut(width.max(1)).enumerate() {
-        write_all(blank, |blank| row(i, blank));
-    }
-    #[allow(unsafe_code)]
-    // SAFETY: the rows cover `out` and each came back written.
-    unsafe {
-        out.assume_init_mut()
-    }
-}
-
 /// Runs `write`, which must hand back what it was given.
 #[inline(always)]
 fn write_all(blank: &mut Blank, write: impl for<'a> FnOnce(&'a mut Blank) -> &'a mut [f32]) {
@@ -67,37 +47,46 @@ fn write_all(blank: &mut Blank, write: impl for<'a> FnOnce(&'a mut Blank) -> &'a
     assert!((written.as_ptr().addr(), written.len()) == place, "a piece is written as a whole");
 }
 
-/// Writes `f(a)` of every element.
-#[inline(always)]
-pub(crate) fn write_1<'a>(out: &'a mut Blank, a: &[f32], f: impl Fn(f32) -> f32) -> &'a mut [f32] {
-    assert_eq!(out.len(), a.len(), "one number per place");
-    for (out, &a) in out.iter_mut().zip(a) {
-        out.write(f(a));
-    }
-    #[allow(unsafe_code)]
-    // SAFETY: `a` is as long as `out`, so that every place was written.
-    unsafe {
-        out.assume_init_mut()
-    }
+/// Writes one number per place of blank memory, computed from the elements of slices, and gives the memory as numbers.
+///
+/// `write_each!(out, x in a, y in b => x + y)`. A macro and no function of a closure: the loop has to become part of the [`vectorized`] function
+/// around it. Panics if the lengths differ.
+///
+/// [`vectorized`]: super::vectorized
+macro_rules! write_each {
+    ($out:expr, $($value:ident in $slice:expr),+ => $number:expr) => {{
+        let out: &mut $crate::fused::Blank = $out;
+        let length = out.len();
+        $(let $value: &[f32] = $slice; assert_eq!($value.len(), length, "one number per place");)+
+        for i in 0..length {
+            $(let $value = $value[i];)+
+            out[i].write($number);
+        }
+        #[allow(unsafe_code)]
+        // SAFETY: the loop wrote every place.
+        unsafe { out.assume_init_mut() }
+    }};
 }
+pub(crate) use write_each;
 
-/// Writes `f(a, b, c)` of every triple of elements.
-#[inline(always)]
-pub(crate) fn write_3<'a>(
-    out: &'a mut Blank,
-    [a, b, c]: [&[f32]; 3],
-    f: impl Fn(f32, f32, f32) -> f32,
-) -> &'a mut [f32] {
-    assert_eq!([a.len(), b.len(), c.len()], [out.len(); 3], "one number per place");
-    for (((out, &a), &b), &c) in out.iter_mut().zip(a).zip(b).zip(c) {
-        out.write(f(a, b, c));
-    }
-    #[allow(unsafe_code)]
-    // SAFETY: `a`, `b` and `c` are as long as `out`, so that every place was written.
-    unsafe {
-        out.assume_init_mut()
-    }
+/// Writes blank memory row by row and gives it as numbers: `write_rows!(out, width, (i, row) => …)`, where the expression writes row `i` and is
+/// that row as numbers. Panics if it is anything else.
+macro_rules! write_rows {
+    ($out:expr, $width:expr, ($i:ident, $row:ident) => $written:expr) => {{
+        let out: &mut $crate::fused::Blank = $out;
+        for ($i, $row) in out.chunks_mut($width).enumerate() {
+            let place = ($row.as_ptr().addr(), $row.len());
+            let written: &mut [f32] = $written;
+            assert!((written.as_ptr().addr(), written.len()) == place, "a row is written as a whole");
+        }
+        #[allow(unsafe_code)]
+        // SAFETY: the rows cover `out` and each came back written.
+        unsafe {
+            out.assume_init_mut()
+        }
+    }};
 }
+pub(crate) use write_rows;
 
 /// Tells the C library's allocator to keep memory that is freed instead of handing it back to the kernel at once.
 ///
@@ -132,10 +121,16 @@ mod tests {
         let source: Vec<f32> = (0..10).map(|i| i as f32).collect();
         let twice = written(10, 4, |i, blank| {
             let from = &source[4 * i..][..blank.len()];
-            write_1(blank, from, |x| 2.0 * x)
+            write_each!(blank, x in from => 2.0 * x)
         });
         assert_eq!(twice, source.iter().map(|x| 2.0 * x).collect::<Vec<_>>());
-        assert_eq!(written(0, 0, |_, blank| write_1(blank, &[], |x| x)), Vec::<f32>::new());
+        let rows = written(
+            10,
+            10,
+            |_, blank| write_rows!(blank, 5, (i, row) => write_each!(row, a in &source[..5], b in &source[5..] => a + b * i as f32)),
+        );
+        assert_eq!(rows, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 9.0, 11.0, 13.0]);
+        assert!(written(0, 0, |_, blank| write_each!(blank, x in &[] => x)).is_empty());
     }
 
     #[test]
@@ -148,6 +143,6 @@ mod tests {
     #[should_panic(expected = "written as a whole")]
     fn a_part_of_a_row_is_refused() {
         let mut memory = [MaybeUninit::uninit(); 4];
-        let _ = write_rows(&mut memory, 4, |_, blank| write_1(&mut blank[..3], &[1.0; 3], |x| x));
+        let _ = write_rows!(&mut memory, 4, (_i, row) => write_each!(&mut row[..3], x in &[1.0; 3] => x));
     }
 }

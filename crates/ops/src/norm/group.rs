@@ -7,7 +7,9 @@ use rayon::prelude::*;
 
 use super::moments;
 use crate::activation::{sigmoid, silu_slope};
-use crate::fused::{Blank, Kernel, fused_3, on_flex, sum, sum_of_products, vectorized, write_1, write_rows, written};
+use crate::fused::{
+    Blank, Kernel, fused_3, on_flex, sum, sum_of_products, vectorized, write_each, write_rows, written,
+};
 use crate::mean_dim;
 
 /// Group norm: mean and variance over each group of channels and all positions, gain and bias per channel.
@@ -143,9 +145,9 @@ vectorized! {
     fn forward_group['a](kernel: &Group, x: &[f32], gain: &[f32], bias: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
         let (mean, variance) = moments(x, true);
         let scale = 1.0 / (variance + kernel.eps).sqrt();
-        write_rows(y, kernel.area, |j, y| {
+        write_rows!(y, kernel.area, (j, y) => {
             let (x, gain, bias) = (&x[j * kernel.area..][..kernel.area], gain[j], bias[j]);
-            let y = write_1(y, x, |x| (x - mean) * scale * gain + bias);
+            let y = write_each!(y, x in x => (x - mean) * scale * gain + bias);
             if kernel.silu {
                 for y in y.iter_mut() {
                     *y *= sigmoid(*y);

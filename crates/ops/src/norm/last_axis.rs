@@ -7,7 +7,8 @@ use rayon::prelude::*;
 
 use super::moments;
 use crate::fused::{
-    Blank, Kernel, fused_1, fused_2, fused_3, on_flex, sum, sum_of_products, vectorized, write_1, write_3, write_rows, written,
+    Blank, Kernel, fused_1, fused_2, fused_3, on_flex, sum, sum_of_products, vectorized, write_each, write_rows,
+    written,
 };
 use crate::mean_dim;
 
@@ -141,16 +142,16 @@ vectorized! {
         y: &'a mut Blank,
     ) -> &'a mut [f32] {
         let width = kernel.width();
-        write_rows(y, width, |i, y| {
+        write_rows!(y, width, (i, y) => {
             let x = &x[i * width..][..width];
             let (mean, variance) = moments(x, kernel.centred);
             let scale = 1.0 / (variance + kernel.eps).sqrt();
             match (gain, bias) {
                 (Some(gain), Some(bias)) => {
-                    write_3(y, [x, gain, bias], |x, gain, bias| (x - mean) * scale * gain + bias)
+                    write_each!(y, x in x, gain in gain, bias in bias => (x - mean) * scale * gain + bias)
                 }
-                (Some(gain), None) => write_3(y, [x, gain, gain], |x, gain, _| (x - mean) * scale * gain),
-                (None, _) => write_1(y, x, |x| (x - mean) * scale),
+                (Some(gain), None) => write_each!(y, x in x, gain in gain => (x - mean) * scale * gain),
+                (None, _) => write_each!(y, x in x => (x - mean) * scale),
             }
         })
     }

@@ -81,7 +81,8 @@ impl Kernel<3> for Modulated {
         let mut sums: Vec<Vec<f32>> = sums.collect();
         // A sample without tokens.
         sums.resize(self.norm.shape[0], vec![0.0; 2 * self.width]);
-        let of = |at: usize| sums.iter().flat_map(|sums| sums[at * self.width..][..self.width].iter().copied()).collect();
+        let of =
+            |at: usize| sums.iter().flat_map(|sums| sums[at * self.width..][..self.width].iter().copied()).collect();
         [wanted[0].then_some(gradient), wanted[1].then(|| of(1)), wanted[2].then(|| of(0))]
     }
 }

@@ -34,6 +34,8 @@ pub fn grid_sample_2d(input: Tensor<4>, grid: Tensor<4>, align_corners: bool, mo
     assert!(h * w > 0, "a map of {h}x{w}");
     if on_flex(&input) && on_flex(&grid) {
         let kernel = GridSampling { output_shape: vec![n, c, ho, wo], extent: [w, h, 1], axes, align_corners, mode };
+        // The nearest pixel does not move with the point.
+        let grid = if mode == Interpolation::Nearest { grid.detach() } else { grid };
         return fused_2(kernel, input, grid);
     }
     let levels = Levels::maps(&[[h, w]], 0.0);
@@ -62,8 +64,7 @@ pub fn grid_sample_3d(input: Tensor<5>, grid: Tensor<5>) -> Tensor<5> {
     assert!(d * h * w > 0, "a volume of {d}x{h}x{w}");
     if on_flex(&input) && on_flex(&grid) {
         let (extent, mode) = ([w, h, d], Interpolation::Bilinear);
-        let kernel =
-            GridSampling { output_shape: vec![n, c, od, oh, ow], extent, axes, align_corners: false, mode };
+        let kernel = GridSampling { output_shape: vec![n, c, od, oh, ow], extent, axes, align_corners: false, mode };
         return fused_2(kernel, input, grid);
     }
     let levels = Levels::volumes(&[[d, h, w]], 0.0);

@@ -7,7 +7,7 @@ use std::borrow::Cow;
 
 use rayon::prelude::*;
 
-use crate::fused::{Blank, Kernel, sum_of_products, vectorized, written};
+use crate::fused::{Blank, Kernel, sum_of_products, vectorized, write_each, written};
 
 use super::super::grid::Interpolation;
 use super::batch::{Batch, POINTS};
@@ -143,8 +143,12 @@ impl Kernel<2> for GridSampling {
         y.into_vec()
     }
 
-    fn backward(&self, [input, grid]: [&[f32]; 2], upstream: Cow<'_, [f32]>, wanted: [bool; 2]) -> [Option<Vec<f32>>; 2] {
-        let wanted = [wanted[0], wanted[1] && self.mode == Interpolation::Bilinear];
+    fn backward(
+        &self,
+        [input, grid]: [&[f32]; 2],
+        upstream: Cow<'_, [f32]>,
+        wanted: [bool; 2],
+    ) -> [Option<Vec<f32>>; 2] {
         let (length, points, sites) = (self.width() * self.points(), self.points(), self.sites());
         let maps = if wanted[1] { self.blocked(input) } else { Vec::new() };
         let mut values = vec![0.0; if wanted[0] { input.len() } else { 0 }];
@@ -179,7 +183,7 @@ impl GridSampling {
             for point in total.chunks_exact_mut(self.axes) {
                 point.iter_mut().zip(scale).for_each(|(x, scale)| *x = *x * scale / 2.0);
             }
-            crate::fused::write_1(out, &total, |x| x)
+            write_each!(out, x in &total => x)
         })
     }
 }
