@@ -68,7 +68,7 @@ fn affine(a: Matrix<'_>, b: Matrix<'_>, bias: Option<&[f32]>) -> Vec<f32> {
     if b.rows * columns <= SMALL {
         return written(rows * columns, TASK_ROWS * columns, |i, y| {
             let count = y.len() / columns;
-            let y = product_into(Threads::One, y, a.from_row(i * TASK_ROWS, count), b);
+            let y = product_into(Threads::One, y, a.rows_at(i * TASK_ROWS, count), b);
             add(y);
             y
         });
@@ -103,7 +103,7 @@ impl Linear {
         let tasks = (0..self.rows.div_ceil(TASK_ROWS)).into_par_iter().map(|task| {
             let first = task * TASK_ROWS;
             let count = TASK_ROWS.min(self.rows - first);
-            let (upstream, x) = (upstream.from_row(first, count), x.from_row(first, count));
+            let (upstream, x) = (upstream.rows_at(first, count), x.rows_at(first, count));
             let mut part = vec![0.0; length];
             let out = MatrixMut::row_major(&mut part, self.d_out, self.d_in);
             product_on(Threads::One, out, upstream.transposed(), x, 1.0, Old::Replaced);

@@ -44,7 +44,7 @@ impl<'a> Matrix<'a> {
     ///
     /// # Panics
     /// If there are fewer rows.
-    pub fn from_row(self, first: usize, count: usize) -> Self {
+    pub fn rows_at(self, first: usize, count: usize) -> Self {
         assert!(first + count <= self.rows, "rows {first} to {} of {}", first + count, self.rows);
         let data = &self.data[if count == 0 { 0 } else { first * self.row_stride }..];
         Self { data, rows: count, ..self }

@@ -30,7 +30,7 @@ fn probabilities(head: Head<'_>, admitted: Admitted<'_>, first: usize, count: us
     let keys = head.k.rows;
     let scale = 1.0 / (head.q.columns as f32).sqrt();
     let out = MatrixMut::row_major(scores, count, keys);
-    product(out, head.q.from_row(first, count), head.k.transposed(), scale, Old::Replaced);
+    product(out, head.q.rows_at(first, count), head.k.transposed(), scale, Old::Replaced);
     for (i, row) in scores.chunks_exact_mut(keys).enumerate() {
         match admitted(first + i) {
             None => softmax_row(row),
@@ -78,7 +78,7 @@ pub(super) fn attend_backward(
         let count = TILE.min(last - from);
         let (scores, changes) = (&mut scores[..count * keys], &mut changes[..count * keys]);
         probabilities(head, admitted, from, count, scores);
-        let g = upstream.from_row(from - first, count);
+        let g = upstream.rows_at(from - first, count);
         let p = Matrix::row_major(scores, count, keys);
         product(MatrixMut::row_major(&mut gradients.v, keys, width), p.transposed(), g, 1.0, Old::Kept);
         product(MatrixMut::row_major(changes, count, keys), g, head.v.transposed(), 1.0, Old::Replaced);
@@ -88,7 +88,7 @@ pub(super) fn attend_backward(
         let ds = Matrix::row_major(changes, count, keys);
         let dq = &mut gradients.q[(from - first) * d..][..count * d];
         product(MatrixMut::row_major(dq, count, d), ds, head.k, scale, Old::Replaced);
-        let q = head.q.from_row(from, count);
+        let q = head.q.rows_at(from, count);
         product(MatrixMut::row_major(&mut gradients.k, keys, d), ds.transposed(), q, scale, Old::Kept);
     }
     gradients
