@@ -104,24 +104,28 @@ def peer(inputs, function):
     def both():
         for x in leaves:
             x.grad = None
-        function(*leaves).sum().backward()
+        y = function(*leaves)
+        y.backward(torch.ones_like(y))
 
     return {"forward": forward, "both": median_ms(both)}
 
 
-def ours(only, threads):
-    """Medians of the Rust bench in milliseconds by kind and name, from the table that divan prints."""
-    command = ["cargo", "bench", "-q", "-p", "rigscape", "-p", "ops", "--bench", "ops", "--", only]
+def ours(bench, only, threads):
+    """Medians of a Rust bench in milliseconds by kind and name, from the table that divan prints."""
+    command = ["cargo", "bench", "-q", "-p", "rigscape", "-p", "ops", "--bench", bench, "--", only]
     output = subprocess.run(command, check=True, env={**os.environ, "RAYON_NUM_THREADS": str(threads)}, capture_output=True, text=True).stdout
     factor = {"ns": 1e-6, "µs": 1e-3, "ms": 1.0, "s": 1e3}
     figures, kind = {}, None
     for line in output.splitlines():
-        cells = [cell.strip(" ├╰─│") for cell in line.split(" │ ")] if " │ " in line else [line.strip(" ├╰─│")]
-        if match := re.match(r"(?:│  |   )?[├╰]─ (forward|both)\b", line):
-            kind = match[1]
-        elif len(cells) > 3 and (match := re.match(r"(.*?)\s{2,}[\d.]+ \S+$", cells[0])):
+        if not (row := re.match(r"(│  |   )?[├╰]─ (.*)", line)):
+            continue
+        cells = [cell.strip() for cell in row[2].split("│")]
+        timed = re.match(r"(.*?)\s{2,}[\d.]+ \S+$", cells[0])
+        if not row[1]:
+            kind = cells[0]
+        if timed:
             number, unit = cells[2].split()
-            figures[kind, match[1]] = float(number) * factor[unit]
+            figures[kind if row[1] else None, timed[1]] = float(number) * factor[unit]
     return figures
 
 
@@ -132,7 +136,7 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(7)
     torch.set_num_threads(args.threads)
-    figures = ours(args.only, args.threads)
+    figures = ours("ops", args.only, args.threads)
     print(f"PyTorch {torch.__version__}, {args.threads} threads, milliseconds (median)\n")
     print("| operation | forward | PyTorch | ratio | forward + backward | PyTorch | ratio |")
     print("|---|---|---|---|---|---|---|")

@@ -19,7 +19,7 @@ pub(crate) fn xavier(d_in: usize, d_out: usize, init: &mut Init) -> Linear {
 /// - tokens and output: `[B, N, D]`
 /// - shift, scale: `[B, 1, D]`
 pub(crate) fn modulated(tokens: Tensor<3>, shift: Tensor<3>, scale: Tensor<3>) -> Tensor<3> {
-    ops::layer_norm(tokens, None, None, NORM_EPSILON) * (scale + 1.0) + shift
+    ops::modulated_layer_norm(tokens, shift, scale, NORM_EPSILON)
 }
 
 /// `count` vectors per sample from SiLU(c): `[B, D]` to `count` times `[B, 1, D]`.

@@ -7,11 +7,11 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
 use nn::weights::{WeightError, WeightFile};
+use ops::{PixelCentres, resize_bilinear};
 
 use crate::conv::{Conv2d, Padding};
 use crate::frozen::{NORM_COUNTER, Values, beside, load_strict};
 use crate::inception::spatial_mean;
-use crate::resample::{PixelCentres, resize_bilinear};
 
 /// Side of the network's input.
 pub const EFFICIENTNET_SIZE: usize = 224;

@@ -8,7 +8,6 @@ mod inception;
 mod known;
 mod loftr;
 mod lpips;
-mod resample;
 mod squeezenet;
 mod vgg16;
 
@@ -18,6 +17,6 @@ pub use inception::{INCEPTION_SIZE, Inception, InceptionMaps, InceptionWeights};
 pub use known::{KNOWN_WEIGHTS, KnownWeights, MissingWeights, StandIn, known_weights, require};
 pub use loftr::{LOFTR_CELL, Loftr, LoftrMatch, MatchRules, mutual_matches};
 pub use lpips::{Lpips, LpipsBackbone};
-pub use resample::{PixelCentres, resize_bilinear};
+pub use ops::{PixelCentres, resize_bilinear};
 pub use squeezenet::SqueezeNet;
 pub use vgg16::{Preprocessing, Tap, Vgg16};

@@ -1,9 +1,11 @@
 //! Activations: GELU, exact and by tanh, and SiLU.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Tensor, activation};
 use rayon::prelude::*;
 
-use crate::fused::{Kernel, exp_difference, fused_1, on_flex, vectorized};
+use crate::fused::{Blank, Kernel, exp_difference, fused_1, on_flex, vectorized, write_each, written};
 
 /// Exact GELU, `x / 2 · (1 + erf(x / √2))`, elementwise.
 ///
@@ -75,75 +77,68 @@ impl Kernel<1> for Activation {
     }
 
     fn forward(&self, [x]: [&[f32]; 1]) -> Vec<f32> {
-        let mut y = vec![0.0; x.len()];
-        let chunks = y.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK));
-        chunks.for_each(|(y, x)| match self.function {
-            Function::Gelu => gelu_forward(x, y),
-            Function::GeluTanh => gelu_tanh_forward(x, y),
-            Function::Silu => silu_forward(x, y),
-        });
-        y
+        written(x.len(), CHUNK, |i, y| {
+            let x = &x[i * CHUNK..][..y.len()];
+            match self.function {
+                Function::Gelu => gelu_forward(x, y),
+                Function::GeluTanh => gelu_tanh_forward(x, y),
+                Function::Silu => silu_forward(x, y),
+            }
+        })
     }
 
-    fn backward(&self, [x]: [&[f32]; 1], upstream: &[f32], _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
-        let mut dx = vec![0.0; x.len()];
-        let chunks = dx.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).zip(upstream.par_chunks(CHUNK));
-        chunks.for_each(|((dx, x), upstream)| match self.function {
-            Function::Gelu => gelu_backward(x, upstream, dx),
-            Function::GeluTanh => gelu_tanh_backward(x, upstream, dx),
-            Function::Silu => silu_backward(x, upstream, dx),
+    fn backward(&self, [x]: [&[f32]; 1], upstream: Cow<'_, [f32]>, _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
+        let mut gradient = upstream.into_owned();
+        gradient.par_chunks_mut(CHUNK).zip(x.par_chunks(CHUNK)).for_each(|(gradient, x)| match self.function {
+            Function::Gelu => gelu_backward(x, gradient),
+            Function::GeluTanh => gelu_tanh_backward(x, gradient),
+            Function::Silu => silu_backward(x, gradient),
         });
-        [Some(dx)]
+        [Some(gradient)]
     }
 }
 
 vectorized! {
-    fn gelu_forward[](x: &[f32], y: &mut [f32]) {
-        for (y, &x) in y.iter_mut().zip(x) {
-            *y = x * normal(x).0;
-        }
+    fn gelu_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
+        write_each!(y, x in x => x * normal(x).0)
     }
 }
 
 vectorized! {
-    fn gelu_backward[](x: &[f32], upstream: &[f32], dx: &mut [f32]) {
-        for ((dx, &x), &upstream) in dx.iter_mut().zip(x).zip(upstream) {
+    fn gelu_backward[](x: &[f32], gradient: &mut [f32]) {
+        for (gradient, &x) in gradient.iter_mut().zip(x) {
             let (cumulative, density) = normal(x);
-            *dx = upstream * (cumulative + x * density);
+            *gradient *= cumulative + x * density;
         }
     }
 }
 
 vectorized! {
-    fn gelu_tanh_forward[](x: &[f32], y: &mut [f32]) {
-        for (y, &x) in y.iter_mut().zip(x) {
-            *y = x * sigmoid(TWICE_SLOPE * (x + CUBIC * x * x * x));
-        }
+    fn gelu_tanh_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
+        write_each!(y, x in x => x * sigmoid(TWICE_SLOPE * (x + CUBIC * x * x * x)))
     }
 }
 
 vectorized! {
-    fn gelu_tanh_backward[](x: &[f32], upstream: &[f32], dx: &mut [f32]) {
-        for ((dx, &x), &upstream) in dx.iter_mut().zip(x).zip(upstream) {
+    fn gelu_tanh_backward[](x: &[f32], gradient: &mut [f32]) {
+        for (gradient, &x) in gradient.iter_mut().zip(x) {
             let s = sigmoid(TWICE_SLOPE * (x + CUBIC * x * x * x));
             let slope = TWICE_SLOPE * (1.0 + 3.0 * CUBIC * x * x);
-            *dx = upstream * (s + x * s * (1.0 - s) * slope);
+            *gradient *= s + x * s * (1.0 - s) * slope;
         }
     }
 }
 
 vectorized! {
-    fn silu_forward[](x: &[f32], y: &mut [f32]) {
-        for (y, &x) in y.iter_mut().zip(x) {
-            *y = x * sigmoid(x);
-        }
+    fn silu_forward['a](x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
+        write_each!(y, x in x => x * sigmoid(x))
     }
 }
 
 vectorized! {
-    fn silu_backward[](x: &[f32], upstream: &[f32], dx: &mut [f32]) {
-        for ((dx, &x), &upstream) in dx.iter_mut().zip(x).zip(upstream) {
-            *dx = upstream * silu_slope(x);
+    fn silu_backward[](x: &[f32], gradient: &mut [f32]) {
+        for (gradient, &x) in gradient.iter_mut().zip(x) {
+            *gradient *= silu_slope(x);
         }
     }
 }
@@ -171,10 +166,10 @@ fn normal(x: f32) -> (f32, f32) {
     // z² to more digits than one f32: the upper half of the mantissa squares exactly, the rest is a small correction.
     let coarse = f32::from_bits(z.to_bits() & 0xffff_f000);
     let exponential = exp_difference(-0.5 * coarse * coarse, 0.5 * (z - coarse) * (z + coarse));
-    let t = 1.0 / (1.0 + 0.35 * z);
+    let t = 1.0 / z.mul_add(0.35, 1.0);
     let mut p = TAIL[0];
     for &coefficient in &TAIL[1..] {
-        p = p * t + coefficient;
+        p = p.mul_add(t, coefficient);
     }
     let tail = exponential * (p * t);
     (if x < 0.0 { tail } else { 1.0 - tail }, PEAK * exponential)

@@ -19,6 +19,7 @@ mod linear;
 mod noise;
 mod norm;
 mod product;
+mod resize;
 mod rotary;
 mod sampling;
 mod softmax;
@@ -27,9 +28,10 @@ mod sums;
 pub use activation::{gelu, gelu_tanh, silu};
 pub use attention::{attention, rotary_attention};
 pub use conv::{conv2d, conv3d};
-pub use fused::composed_only;
+pub use fused::{composed_only, keep_freed_memory};
 pub use linear::linear;
-pub use norm::{group_norm, group_norm_silu, layer_norm, rms_norm};
+pub use norm::{group_norm, group_norm_silu, layer_norm, modulated_layer_norm, rms_norm};
+pub use resize::{PixelCentres, resize_bilinear};
 pub use rotary::rotary;
 pub use sampling::{
     Interpolation, deformable_rays_3d, deformable_sample_2d, deformable_sample_3d, deformable_views_2d, grid_sample_2d,

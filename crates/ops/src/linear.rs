@@ -1,10 +1,12 @@
 //! Affine maps over the last axis.
 
+use std::borrow::Cow;
+
 use burn::tensor::Tensor;
 use rayon::prelude::*;
 
-use crate::fused::{Kernel, fused_2, fused_3, on_flex};
-use crate::product::{Matrix, MatrixMut, Old, product};
+use crate::fused::{Blank, Kernel, fused_2, fused_3, on_flex, vectorized, written};
+use crate::product::{Matrix, MatrixMut, Old, Threads, product, product_into, product_on};
 
 /// `y = x Wᵀ + b` over the last axis.
 ///
@@ -50,41 +52,91 @@ struct Linear {
     d_out: usize,
 }
 
+/// Weights with at most this many numbers are cheap to read again: work is shared by rows then, not inside the product.
+const SMALL: usize = 1 << 14;
+/// Rows of a task where work is shared by rows. Fixed, because gradients of weights are summed per task.
+const TASK_ROWS: usize = 512;
+
+/// `a · b` plus a bias per column.
+fn affine(a: Matrix<'_>, b: Matrix<'_>, bias: Option<&[f32]>) -> Vec<f32> {
+    let (rows, columns) = (a.rows, b.columns);
+    let add = |y: &mut [f32]| {
+        if let Some(bias) = bias {
+            add_to_rows(y, bias);
+        }
+    };
+    if b.rows * columns <= SMALL {
+        return written(rows * columns, TASK_ROWS * columns, |i, y| {
+            let count = y.len() / columns;
+            let y = product_into(Threads::One, y, a.rows_at(i * TASK_ROWS, count), b);
+            add(y);
+            y
+        });
+    }
+    let mut y = written(rows * columns, rows * columns, |_, y: &mut Blank| product_into(Threads::Shared, y, a, b));
+    if bias.is_some() {
+        y.par_chunks_mut((TASK_ROWS * columns).max(1)).for_each(add);
+    }
+    y
+}
+
+vectorized! {
+    fn add_to_rows[](y: &mut [f32], bias: &[f32]) {
+        for y in y.chunks_exact_mut(bias.len()) {
+            for (y, &bias) in y.iter_mut().zip(bias) {
+                *y += bias;
+            }
+        }
+    }
+}
+
+impl Linear {
+    /// Gradient of the weight, `upstreamᵀ · x`.
+    fn weight_gradient(&self, x: Matrix<'_>, upstream: Matrix<'_>) -> Vec<f32> {
+        let length = self.d_out * self.d_in;
+        let mut total = vec![0.0; length];
+        if length > SMALL || self.rows <= TASK_ROWS {
+            let out = MatrixMut::row_major(&mut total, self.d_out, self.d_in);
+            product(out, upstream.transposed(), x, 1.0, Old::Replaced);
+            return total;
+        }
+        let tasks = (0..self.rows.div_ceil(TASK_ROWS)).into_par_iter().map(|task| {
+            let first = task * TASK_ROWS;
+            let count = TASK_ROWS.min(self.rows - first);
+            let (upstream, x) = (upstream.rows_at(first, count), x.rows_at(first, count));
+            let mut part = vec![0.0; length];
+            let out = MatrixMut::row_major(&mut part, self.d_out, self.d_in);
+            product_on(Threads::One, out, upstream.transposed(), x, 1.0, Old::Replaced);
+            part
+        });
+        let parts: Vec<Vec<f32>> = tasks.collect();
+        for part in parts {
+            total.iter_mut().zip(part).for_each(|(total, part)| *total += part);
+        }
+        total
+    }
+}
+
 impl<const N: usize> Kernel<N> for Linear {
     fn output_shape(&self) -> Vec<usize> {
         self.output.clone()
     }
 
     fn forward(&self, inputs: [&[f32]; N]) -> Vec<f32> {
-        let (x, weight) = (inputs[0], inputs[1]);
-        let (mut y, old) = match inputs.get(2) {
-            Some(bias) => (bias.repeat(self.rows), Old::Kept),
-            None => (vec![0.0; self.rows * self.d_out], Old::Replaced),
-        };
-        let x = Matrix::row_major(x, self.rows, self.d_in);
-        let weight = Matrix::row_major(weight, self.d_out, self.d_in);
-        product(MatrixMut::row_major(&mut y, self.rows, self.d_out), x, weight.transposed(), 1.0, old);
-        y
+        let x = Matrix::row_major(inputs[0], self.rows, self.d_in);
+        let weight = Matrix::row_major(inputs[1], self.d_out, self.d_in);
+        affine(x, weight.transposed(), inputs.get(2).copied())
     }
 
-    fn backward(&self, inputs: [&[f32]; N], upstream: &[f32], wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
-        let upstream_matrix = Matrix::row_major(upstream, self.rows, self.d_out);
+    fn backward(&self, inputs: [&[f32]; N], upstream: Cow<'_, [f32]>, wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
+        let x = Matrix::row_major(inputs[0], self.rows, self.d_in);
+        let weight = Matrix::row_major(inputs[1], self.d_out, self.d_in);
+        let gradient = Matrix::row_major(&upstream, self.rows, self.d_out);
         let mut gradients = [const { None }; N];
-        gradients[0] = wanted[0].then(|| {
-            let mut dx = vec![0.0; self.rows * self.d_in];
-            let weight = Matrix::row_major(inputs[1], self.d_out, self.d_in);
-            product(MatrixMut::row_major(&mut dx, self.rows, self.d_in), upstream_matrix, weight, 1.0, Old::Replaced);
-            dx
-        });
-        gradients[1] = wanted[1].then(|| {
-            let mut dw = vec![0.0; self.d_out * self.d_in];
-            let x = Matrix::row_major(inputs[0], self.rows, self.d_in);
-            let out = MatrixMut::row_major(&mut dw, self.d_out, self.d_in);
-            product(out, upstream_matrix.transposed(), x, 1.0, Old::Replaced);
-            dw
-        });
-        if let (Some(gradient), Some(true)) = (gradients.get_mut(2), wanted.get(2)) {
-            *gradient = Some(column_sums(upstream, self.d_out));
+        gradients[0] = wanted[0].then(|| affine(gradient, weight, None));
+        gradients[1] = wanted[1].then(|| self.weight_gradient(x, gradient));
+        if let (Some(bias), Some(true)) = (gradients.get_mut(2), wanted.get(2)) {
+            *bias = Some(column_sums(&upstream, self.d_out));
         }
         gradients
     }

@@ -1,5 +1,7 @@
 //! Matrix products of slices: a bounds-checked face of the crate `gemm`, which reaches the machine's peak on one core and takes any strides.
 
+use crate::fused::{Blank, write_each};
+
 /// A matrix inside a slice; element (i, j) is `data[i·row_stride + j·column_stride]`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Matrix<'a> {
@@ -38,6 +40,16 @@ impl<'a> Matrix<'a> {
         Self { data, rows, columns, row_stride: columns, column_stride: 1 }
     }
 
+    /// `count` rows from row `first` on.
+    ///
+    /// # Panics
+    /// If there are fewer rows.
+    pub fn rows_at(self, first: usize, count: usize) -> Self {
+        assert!(first + count <= self.rows, "rows {first} to {} of {}", first + count, self.rows);
+        let data = &self.data[if count == 0 { 0 } else { first * self.row_stride }..];
+        Self { data, rows: count, ..self }
+    }
+
     /// Rows and columns exchanged.
     pub fn transposed(self) -> Self {
         Self {
@@ -57,6 +69,15 @@ impl<'a> MatrixMut<'a> {
     }
 }
 
+/// Which threads a product may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Threads {
+    /// The caller's alone, which shares the work otherwise.
+    One,
+    /// All, where the product is worth it.
+    Shared,
+}
+
 /// Index behind the last element that the strides reach; 0 for an empty matrix.
 fn extent(rows: usize, columns: usize, row_stride: usize, column_stride: usize) -> usize {
     if rows == 0 || columns == 0 { 0 } else { (rows - 1) * row_stride + (columns - 1) * column_stride + 1 }
@@ -68,36 +89,88 @@ fn extent(rows: usize, columns: usize, row_stride: usize, column_stride: usize) 
 /// # Panics
 /// If the shapes disagree, a matrix does not fit its slice, or rows of `out` overlap.
 pub(crate) fn product(out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f32, old: Old) {
-    let (m, n, k) = (a.rows, b.columns, a.columns);
-    assert_eq!((out.rows, out.columns, b.rows), (m, n, k), "shapes of a matrix product");
-    for (x, what) in [(&a, "left"), (&b, "right")] {
-        assert!(
-            extent(x.rows, x.columns, x.row_stride, x.column_stride) <= x.data.len(),
-            "{what} matrix leaves its slice"
-        );
-    }
-    assert!(extent(m, n, out.row_stride, out.column_stride) <= out.data.len(), "result leaves its slice");
+    product_on(Threads::Shared, out, a, b, scale, old);
+}
+
+/// As [`product`], on the threads named.
+pub(crate) fn product_on(threads: Threads, out: MatrixMut<'_>, a: Matrix<'_>, b: Matrix<'_>, scale: f32, old: Old) {
+    check_inputs([out.rows, out.columns], a, b);
+    assert!(
+        extent(out.rows, out.columns, out.row_stride, out.column_stride) <= out.data.len(),
+        "result leaves its slice"
+    );
+    let (m, n) = (out.rows, out.columns);
     let (long, short, inner) = if out.row_stride >= out.column_stride {
         (out.row_stride, out.column_stride, n)
     } else {
         (out.column_stride, out.row_stride, m)
     };
     assert!(m * n <= 1 || (short > 0 && long >= short * inner) || m == 1 || n == 1, "elements of the result overlap");
-    if m == 0 || n == 0 {
-        return;
-    }
-    let parallelism = if m * n * k >= PARALLEL_FROM { gemm::Parallelism::Rayon(0) } else { gemm::Parallelism::None };
     #[allow(unsafe_code)]
     // SAFETY: every index that the strides reach lies inside its slice and the result's elements do not overlap, both checked above; the
     // borrows rule out that the result overlaps an input.
+    unsafe {
+        multiply(threads, out.data.as_mut_ptr(), [out.row_stride, out.column_stride], a, b, scale, old);
+    }
+}
+
+/// `a · b`, row-major, into memory that is not written yet.
+///
+/// # Panics
+/// If the shapes disagree, a matrix does not fit its slice, or `out` has another size than the result.
+pub(crate) fn product_into<'a>(threads: Threads, out: &'a mut Blank, a: Matrix<'_>, b: Matrix<'_>) -> &'a mut [f32] {
+    let (m, n) = (a.rows, b.columns);
+    check_inputs([m, n], a, b);
+    assert_eq!(out.len(), m * n, "size of the result");
+    if a.columns == 0 {
+        return write_each!(out, zero in &vec![0.0; m * n] => zero);
+    }
+    #[allow(unsafe_code)]
+    // SAFETY: as in `product_on`; the result is as large as `out` and its old values are never read, so that all of `out` is written.
+    unsafe {
+        multiply(threads, out.as_mut_ptr().cast(), [n, 1], a, b, 1.0, Old::Replaced);
+        out.assume_init_mut()
+    }
+}
+
+fn check_inputs([m, n]: [usize; 2], a: Matrix<'_>, b: Matrix<'_>) {
+    assert_eq!((a.rows, b.columns, b.rows), (m, n, a.columns), "shapes of a matrix product");
+    for (x, what) in [(&a, "left"), (&b, "right")] {
+        assert!(
+            extent(x.rows, x.columns, x.row_stride, x.column_stride) <= x.data.len(),
+            "{what} matrix leaves its slice"
+        );
+    }
+}
+
+#[allow(unsafe_code)]
+/// # Safety
+/// The inputs fit their slices and the result, `[a.rows, b.columns]` with these strides, its memory, whose elements do not overlap. Old values
+/// that are kept have been written.
+unsafe fn multiply(
+    threads: Threads,
+    out: *mut f32,
+    [row_stride, column_stride]: [usize; 2],
+    a: Matrix<'_>,
+    b: Matrix<'_>,
+    scale: f32,
+    old: Old,
+) {
+    let (m, n, k) = (a.rows, b.columns, a.columns);
+    if m == 0 || n == 0 {
+        return;
+    }
+    let shared = threads == Threads::Shared && m * n * k >= PARALLEL_FROM;
+    let parallelism = if shared { gemm::Parallelism::Rayon(0) } else { gemm::Parallelism::None };
+    // SAFETY: passed on to the caller.
     unsafe {
         gemm::gemm(
             m,
             n,
             k,
-            out.data.as_mut_ptr(),
-            out.column_stride as isize,
-            out.row_stride as isize,
+            out,
+            column_stride as isize,
+            row_stride as isize,
             old == Old::Kept,
             a.data.as_ptr(),
             a.column_stride as isize,

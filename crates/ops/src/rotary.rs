@@ -1,5 +1,7 @@
 //! Rotary position embedding on adjacent channel pairs.
 
+use std::borrow::Cow;
+
 use burn::tensor::Tensor;
 use rayon::prelude::*;
 
@@ -53,8 +55,8 @@ impl Kernel<1> for Rotation {
         self.rotate(x, 1.0)
     }
 
-    fn backward(&self, _inputs: [&[f32]; 1], upstream: &[f32], _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
-        [Some(self.rotate(upstream, -1.0))]
+    fn backward(&self, _inputs: [&[f32]; 1], upstream: Cow<'_, [f32]>, _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
+        [Some(self.rotate(&upstream, -1.0))]
     }
 }
 

@@ -1,9 +1,14 @@
 //! Softmax over the last axis.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Tensor, activation};
 use rayon::prelude::*;
 
-use crate::fused::{Kernel, exp_difference, fused_1, on_flex, sum, sum_of_products, vectorized};
+use crate::fused::{
+    Blank, Kernel, exp_difference, fused_1, largest, on_flex, sum, sum_of_products, vectorized, write_each, write_rows,
+    written,
+};
 
 /// Softmax over the last axis: `exp(x - max) / Σ exp(x - max)`.
 ///
@@ -40,50 +45,45 @@ impl Kernel<1> for Softmax {
 
     fn forward(&self, [x]: [&[f32]; 1]) -> Vec<f32> {
         let (width, chunk) = self.sizes();
-        let mut y = vec![0.0; x.len()];
-        y.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).for_each(|(y, x)| forward_rows(x, width, y));
-        y
+        written(x.len(), chunk, |i, y| forward_rows(&x[i * chunk..][..y.len()], width, y))
     }
 
-    fn backward(&self, [x]: [&[f32]; 1], upstream: &[f32], _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
+    fn backward(&self, [x]: [&[f32]; 1], upstream: Cow<'_, [f32]>, _wanted: [bool; 1]) -> [Option<Vec<f32>>; 1] {
         let (width, chunk) = self.sizes();
-        let mut dx = vec![0.0; x.len()];
-        let chunks = dx.par_chunks_mut(chunk).zip(x.par_chunks(chunk)).zip(upstream.par_chunks(chunk));
-        chunks.for_each(|((dx, x), upstream)| backward_rows(x, upstream, width, dx));
-        [Some(dx)]
+        let mut gradient = upstream.into_owned();
+        let chunks = gradient.par_chunks_mut(chunk).zip(x.par_chunks(chunk));
+        chunks.for_each(|(gradient, x)| backward_rows(x, width, gradient));
+        [Some(gradient)]
     }
 }
 
 /// Writes the probabilities of one row.
 #[inline(always)]
-fn probabilities(x: &[f32], y: &mut [f32]) {
-    let largest = x.iter().fold(f32::NEG_INFINITY, |largest, &x| if x > largest { x } else { largest });
-    for (y, &x) in y.iter_mut().zip(x) {
-        *y = exp_difference(x - largest, 0.0);
-    }
+fn probabilities<'a>(x: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
+    let largest = largest(x);
+    let y = write_each!(y, x in x => exp_difference(x - largest, 0.0));
     let scale = 1.0 / sum(y);
-    for y in y {
+    for y in y.iter_mut() {
         *y *= scale;
     }
+    y
 }
 
 vectorized! {
-    fn forward_rows[](x: &[f32], width: usize, y: &mut [f32]) {
-        for (y, x) in y.chunks_exact_mut(width).zip(x.chunks_exact(width)) {
-            probabilities(x, y);
-        }
+    fn forward_rows['a](x: &[f32], width: usize, y: &'a mut Blank) -> &'a mut [f32] {
+        write_rows!(y, width, (i, y) => probabilities(&x[i * width..][..width], y))
     }
 }
 
 vectorized! {
-    /// `dx = y·(g - Σ g·y)`, the probabilities y computed again rather than kept.
-    fn backward_rows[](x: &[f32], upstream: &[f32], width: usize, dx: &mut [f32]) {
-        let rows = dx.chunks_exact_mut(width).zip(x.chunks_exact(width)).zip(upstream.chunks_exact(width));
-        for ((dx, x), upstream) in rows {
-            probabilities(x, dx);
-            let mean = sum_of_products(dx, upstream);
-            for (dx, &upstream) in dx.iter_mut().zip(upstream) {
-                *dx *= upstream - mean;
+    /// `y·(g - Σ g·y)` in the place of g, the probabilities y computed again rather than kept.
+    fn backward_rows[](x: &[f32], width: usize, gradient: &mut [f32]) {
+        let mut y = Box::<[f32]>::new_uninit_slice(width);
+        for (gradient, x) in gradient.chunks_exact_mut(width).zip(x.chunks_exact(width)) {
+            let y = probabilities(x, &mut y);
+            let mean = sum_of_products(y, gradient);
+            for (gradient, &y) in gradient.iter_mut().zip(y.iter()) {
+                *gradient = y * (*gradient - mean);
             }
         }
     }

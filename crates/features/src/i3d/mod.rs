@@ -9,9 +9,9 @@ use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
 use nn::weights::{WeightError, WeightFile};
+use ops::{PixelCentres, resize_bilinear};
 
 use crate::frozen::{NORM_COUNTER, Values, beside, load_strict};
-use crate::resample::{PixelCentres, resize_bilinear};
 use layers::{Conv3d, MaxPool3d, Mixed};
 
 /// Side of the network's input.

@@ -13,9 +13,9 @@ use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
 use nn::weights::{WeightError, WeightFile};
+use ops::{PixelCentres, resize_bilinear};
 
 use crate::frozen::{NORM_COUNTER, Values, beside, load_strict};
-use crate::resample::{PixelCentres, resize_bilinear};
 use blocks::{Block, LastPool, Unit};
 
 /// Side of the network's input.

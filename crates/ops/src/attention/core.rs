@@ -1,6 +1,6 @@
 //! Attention of one head over matrices, forward and backward, for a few queries at a time.
 
-use crate::fused::{exp_difference, sum, sum_of_products, vectorized};
+use crate::fused::{exp_difference, largest, sum, sum_of_products, vectorized};
 use crate::product::{Matrix, MatrixMut, Old, product};
 
 /// Queries whose scores are held at a time.
@@ -25,16 +25,12 @@ pub(super) struct HeadGradients {
 /// Which keys a query may attend; `None` where it may attend all.
 pub(super) type Admitted<'a> = &'a (dyn Fn(usize) -> Option<&'a [bool]> + Sync);
 
-fn rows<'a>(x: Matrix<'a>, from: usize, count: usize) -> Matrix<'a> {
-    Matrix { data: &x.data[from * x.row_stride..], rows: count, ..x }
-}
-
 /// The probabilities `[count, K]` of the queries from `first` on.
 fn probabilities(head: Head<'_>, admitted: Admitted<'_>, first: usize, count: usize, scores: &mut [f32]) {
     let keys = head.k.rows;
     let scale = 1.0 / (head.q.columns as f32).sqrt();
     let out = MatrixMut::row_major(scores, count, keys);
-    product(out, rows(head.q, first, count), head.k.transposed(), scale, Old::Replaced);
+    product(out, head.q.rows_at(first, count), head.k.transposed(), scale, Old::Replaced);
     for (i, row) in scores.chunks_exact_mut(keys).enumerate() {
         match admitted(first + i) {
             None => softmax_row(row),
@@ -82,7 +78,7 @@ pub(super) fn attend_backward(
         let count = TILE.min(last - from);
         let (scores, changes) = (&mut scores[..count * keys], &mut changes[..count * keys]);
         probabilities(head, admitted, from, count, scores);
-        let g = rows(upstream, from - first, count);
+        let g = upstream.rows_at(from - first, count);
         let p = Matrix::row_major(scores, count, keys);
         product(MatrixMut::row_major(&mut gradients.v, keys, width), p.transposed(), g, 1.0, Old::Kept);
         product(MatrixMut::row_major(changes, count, keys), g, head.v.transposed(), 1.0, Old::Replaced);
@@ -92,7 +88,7 @@ pub(super) fn attend_backward(
         let ds = Matrix::row_major(changes, count, keys);
         let dq = &mut gradients.q[(from - first) * d..][..count * d];
         product(MatrixMut::row_major(dq, count, d), ds, head.k, scale, Old::Replaced);
-        let q = rows(head.q, from, count);
+        let q = head.q.rows_at(from, count);
         product(MatrixMut::row_major(&mut gradients.k, keys, d), ds.transposed(), q, scale, Old::Kept);
     }
     gradients
@@ -100,7 +96,7 @@ pub(super) fn attend_backward(
 
 vectorized! {
     fn softmax_row[](row: &mut [f32]) {
-        let largest = row.iter().fold(f32::NEG_INFINITY, |largest, &x| if x > largest { x } else { largest });
+        let largest = largest(row);
         for x in row.iter_mut() {
             *x = exp_difference(*x - largest, 0.0);
         }

@@ -1,5 +1,7 @@
 //! Attention over `[B, H, N, D]` tensors.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Bool, Tensor};
 use rayon::prelude::*;
 
@@ -7,9 +9,9 @@ use super::core::{Head, HeadGradients, attend, attend_backward};
 use crate::fused::Kernel;
 use crate::product::Matrix;
 
-/// Parts into which the queries of all heads together are divided at least, if there are so many. Fixed, because the gradients of keys and
-/// values are summed over parts.
-const PARTS: usize = 16;
+/// Queries of a part of a head. Fixed, because the gradients of keys and values are summed over parts, which neither the number of threads nor
+/// that of batch items may change.
+const PART: usize = 512;
 
 /// Inputs: q, k, v.
 #[derive(Debug)]
@@ -32,7 +34,8 @@ pub(super) struct Mask {
 impl Mask {
     pub fn new(mask: Tensor<4, Bool>, keys: usize) -> Self {
         let [b, h, n, _] = mask.dims();
-        let values = mask.expand([b, h, n, keys]).into_data().convert::<bool>();
+        let mask = if mask.dims()[3] == keys { mask } else { mask.expand([b, h, n, keys]) };
+        let values = mask.into_data().convert::<bool>();
         let values = values.try_to_vec::<bool>().expect("a tensor of truth values");
         Self { values, dims: [b, h, n], keys }
     }
@@ -44,15 +47,6 @@ impl Mask {
 }
 
 impl Attention {
-    /// Queries per part, and parts per head.
-    fn parts(&self) -> [usize; 2] {
-        let [b, h] = self.heads;
-        let n = self.sizes[0];
-        let parts = PARTS.div_ceil((b * h).max(1));
-        let size = n.div_ceil(parts).next_multiple_of(64).max(1);
-        [size, n.div_ceil(size)]
-    }
-
     fn head<'a>(&self, [q, k, v]: [&'a [f32]; 3], at: usize) -> Head<'a> {
         let [n, keys, d, e] = self.sizes;
         Head {
@@ -76,38 +70,36 @@ impl Kernel<3> for Attention {
 
     fn forward(&self, inputs: [&[f32]; 3]) -> Vec<f32> {
         let [n, _, _, e] = self.sizes;
-        let [part, _] = self.parts();
         let mut out = vec![0.0; self.output_shape().iter().product()];
         out.par_chunks_mut((n * e).max(1)).enumerate().for_each(|(at, out)| {
             let head = self.head(inputs, at);
-            out.par_chunks_mut((part * e).max(1)).enumerate().for_each(|(i, out)| {
-                let first = i * part;
-                attend(head, &|query| self.admitted(at, query), first, n.min(first + part), out);
+            out.par_chunks_mut((PART * e).max(1)).enumerate().for_each(|(i, out)| {
+                let first = i * PART;
+                attend(head, &|query| self.admitted(at, query), first, n.min(first + PART), out);
             });
         });
         out
     }
 
-    fn backward(&self, inputs: [&[f32]; 3], upstream: &[f32], _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
+    fn backward(&self, inputs: [&[f32]; 3], upstream: Cow<'_, [f32]>, _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
         let ([b, h], [n, keys, d, e]) = (self.heads, self.sizes);
-        let [part, parts] = self.parts();
         let mut gradients = [b * h * n * d, b * h * keys * d, b * h * keys * e].map(|length| vec![0.0; length]);
         let [dq, dk, dv] = &mut gradients;
         let chunks = dq.par_chunks_mut((n * d).max(1)).zip(dk.par_chunks_mut((keys * d).max(1)));
         let chunks = chunks.zip(dv.par_chunks_mut((keys * e).max(1))).enumerate();
         chunks.for_each(|(at, ((dq, dk), dv))| {
             let head = self.head(inputs, at);
-            let parts: Vec<HeadGradients> = (0..parts)
+            let parts: Vec<HeadGradients> = (0..n.div_ceil(PART))
                 .into_par_iter()
                 .map(|i| {
-                    let (first, last) = (i * part, n.min((i + 1) * part));
+                    let (first, last) = (i * PART, n.min((i + 1) * PART));
                     let upstream = &upstream[(at * n + first) * e..][..(last - first) * e];
                     let upstream = Matrix::row_major(upstream, last - first, e);
                     attend_backward(head, &|query| self.admitted(at, query), first, last, upstream)
                 })
                 .collect();
             for (i, from) in parts.into_iter().enumerate() {
-                dq[i * part * d..][..from.q.len()].copy_from_slice(&from.q);
+                dq[i * PART * d..][..from.q.len()].copy_from_slice(&from.q);
                 dk.iter_mut().zip(from.k).for_each(|(total, part)| *total += part);
                 dv.iter_mut().zip(from.v).for_each(|(total, part)| *total += part);
             }

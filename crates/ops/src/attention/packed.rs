@@ -1,5 +1,7 @@
 //! Self-attention straight from the joint projection, with normalised and rotated queries and keys.
 
+use std::borrow::Cow;
+
 use burn::tensor::Tensor;
 use rayon::prelude::*;
 
@@ -163,9 +165,10 @@ impl Kernel<3> for PackedAttention {
         self.interleave(1, |at, _| &heads[at])
     }
 
-    fn backward(&self, inputs: [&[f32]; 3], upstream: &[f32], _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
+    fn backward(&self, inputs: [&[f32]; 3], upstream: Cow<'_, [f32]>, _wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
         let heads = 0..self.batch * self.heads;
-        let heads: Vec<Gradients> = heads.into_par_iter().map(|at| self.head_gradients(inputs, upstream, at)).collect();
+        let heads: Vec<Gradients> =
+            heads.into_par_iter().map(|at| self.head_gradients(inputs, &upstream, at)).collect();
         let gain = |i: usize| {
             let mut total = vec![0.0; self.width];
             for head in &heads {

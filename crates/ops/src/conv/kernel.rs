@@ -3,12 +3,17 @@
 //! The input is laid out with channels last and zeros around it. The taps of one row then are `taps·C` neighbouring numbers, and those of the
 //! next cell start C later: a matrix whose rows overlap, which the product reads in place. One product per tap row and the sum is done.
 
+use std::borrow::Cow;
+
 use rayon::prelude::*;
 
+use super::layout::{
+    flipped_tap_rows, from_tap_rows, padded_channels_last, spread_channels_last, store, to_scratch, to_tap_rows,
+};
 use super::window::Window;
-use crate::fused::Kernel;
+use crate::fused::{Blank, Kernel};
 use crate::linear::column_sums;
-use crate::product::{Matrix, MatrixMut, Old, product};
+use crate::product::{Matrix, MatrixMut, Old, Threads, product, product_on};
 
 /// Inputs: x `[B, C, ..]`, weight `[O, C, ..]`, then bias `[O]` where there is one.
 #[derive(Debug)]
@@ -93,31 +98,22 @@ impl<const N: usize> Kernel<N> for Convolution {
         let (weight, bias) = (inputs[1], inputs.get(2).copied());
         let taps = self.window.taps.iter().product();
         let weight = to_tap_rows(weight, self.c_out, self.c_in, taps);
-        let [input, output] = self.chunks();
-        let mut y = vec![0.0; self.output_shape.iter().product()];
-        y.par_chunks_mut(output).zip(inputs[0].par_chunks(input)).for_each(|(y, x)| {
-            let window = &self.window;
-            let x = padded_channels_last(x, self.c_in, window);
-            let scratch = correlate(&x, &weight, [self.c_in, self.c_out], window);
-            from_scratch(&scratch, self.c_out, window, bias, y);
-        });
-        y
+        let correlation = Correlation { window: self.window, weight: &weight, channels: [self.c_in, self.c_out], bias };
+        let pictures = inputs[0].par_chunks(self.chunks()[0]);
+        let pictures: Vec<_> = pictures.map(|x| padded_channels_last(x, self.c_in, &self.window)).collect();
+        correlation.run(&pictures, self.output_shape.iter().product())
     }
 
-    fn backward(&self, inputs: [&[f32]; N], upstream: &[f32], wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
-        let [input, output] = self.chunks();
+    fn backward(&self, inputs: [&[f32]; N], upstream: Cow<'_, [f32]>, wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
+        let upstream = upstream.as_ref();
         let taps = self.window.taps.iter().product();
         let mut gradients = [const { None }; N];
         gradients[0] = wanted[0].then(|| {
-            let flipped = flipped_tap_rows(inputs[1], self.c_out, self.c_in, taps);
-            let mut dx = vec![0.0; inputs[0].len()];
-            dx.par_chunks_mut(input).zip(upstream.par_chunks(output)).for_each(|(dx, upstream)| {
-                let reversed = self.window.reversed();
-                let spread = spread_channels_last(upstream, self.c_out, &self.window);
-                let scratch = correlate(&spread, &flipped, [self.c_out, self.c_in], &reversed);
-                from_scratch(&scratch, self.c_in, &reversed, None, dx);
-            });
-            dx
+            let weight = flipped_tap_rows(inputs[1], self.c_out, self.c_in, taps);
+            let (window, channels) = (self.window.reversed(), [self.c_out, self.c_in]);
+            let pictures = upstream.par_chunks(self.chunks()[1]);
+            let pictures: Vec<_> = pictures.map(|g| spread_channels_last(g, self.c_out, &self.window)).collect();
+            Correlation { window, weight: &weight, channels, bias: None }.run(&pictures, inputs[0].len())
         });
         gradients[1] = wanted[1].then(|| self.weight_gradient(inputs[0], upstream));
         if let (Some(gradient), Some(true)) = (gradients.get_mut(2), wanted.get(2)) {
@@ -136,155 +132,76 @@ impl Convolution {
     }
 }
 
-/// The output's scratch, `[scratch cells, O]`, of one padded picture `[cells, C]`.
-fn correlate(x: &[f32], weight: &[f32], [c_in, c_out]: [usize; 2], window: &Window) -> Vec<f32> {
-    let mut scratch = vec![0.0; window.scratch_cells() * c_out];
-    let row = window.taps[2] * c_in;
-    for stretch in window.stretches() {
-        for (i, tap) in window.tap_rows().into_iter().enumerate() {
-            let inputs = Matrix {
-                data: &x[(stretch.input + tap) * c_in..],
-                rows: stretch.rows,
-                columns: row,
-                row_stride: window.stride[2] * c_in,
-                column_stride: 1,
-            };
-            let weight = Matrix::row_major(&weight[i * row * c_out..], row, c_out);
-            let out = MatrixMut::row_major(&mut scratch[stretch.output * c_out..], stretch.rows, c_out);
-            product(out, inputs, weight, 1.0, if i == 0 { Old::Replaced } else { Old::Kept });
-        }
-    }
-    scratch
+/// Cells of a task's scratch, about: it stays in the second-level cache over all taps. Fixed, as sums run over the taps of one task.
+const TASK_CELLS: usize = 512;
+
+/// A correlation of padded pictures `[cells, C]` with a kernel `[taps, C, O]`.
+struct Correlation<'a> {
+    window: Window,
+    weight: &'a [f32],
+    /// C and O.
+    channels: [usize; 2],
+    bias: Option<&'a [f32]>,
 }
 
-/// Lays a kernel `[O, C, taps]` out as `[taps, C, O]`.
-fn to_tap_rows(weight: &[f32], c_out: usize, c_in: usize, taps: usize) -> Vec<f32> {
-    let mut rows = vec![0.0; weight.len()];
-    for (o, weight) in weight.chunks_exact((c_in * taps).max(1)).enumerate() {
-        for (c, weight) in weight.chunks_exact(taps).enumerate() {
-            for (tap, &value) in weight.iter().enumerate() {
-                rows[(tap * c_in + c) * c_out + o] = value;
-            }
+impl Correlation<'_> {
+    /// The outputs `[O, z, y, x]` of all pictures, `length` numbers.
+    fn run(&self, pictures: &[Vec<f32>], length: usize) -> Vec<f32> {
+        let mut y = Box::<[f32]>::new_uninit_slice(length);
+        if length > 0 {
+            let runs = self.window.runs(TASK_CELLS);
+            let tasks: Vec<_> = self.places(&runs, &mut y).into_iter().enumerate().collect();
+            tasks.into_par_iter().for_each(|(task, places)| {
+                let [first, last] = runs[task % runs.len()];
+                let scratch = self.scratch(&pictures[task / runs.len()], first, last);
+                store(&scratch, &self.window, [first, last], self.bias, places);
+            });
         }
+        #[allow(unsafe_code)]
+        // SAFETY: the runs cover every row of the output, each task got the places of its run in every channel, and `store` writes all of them.
+        let y = unsafe { y.assume_init() };
+        y.into_vec()
     }
-    rows
-}
 
-/// Undoes [`to_tap_rows`].
-fn from_tap_rows(rows: &[f32], c_out: usize, c_in: usize, taps: usize) -> Vec<f32> {
-    let mut weight = vec![0.0; rows.len()];
-    for (o, weight) in weight.chunks_exact_mut((c_in * taps).max(1)).enumerate() {
-        for (c, weight) in weight.chunks_exact_mut(taps).enumerate() {
-            for (tap, value) in weight.iter_mut().enumerate() {
-                *value = rows[(tap * c_in + c) * c_out + o];
-            }
-        }
-    }
-    weight
-}
-
-/// Lays a kernel `[O, C, taps]` out as `[taps backwards, O, C]`.
-fn flipped_tap_rows(weight: &[f32], c_out: usize, c_in: usize, taps: usize) -> Vec<f32> {
-    let mut rows = vec![0.0; weight.len()];
-    for (o, weight) in weight.chunks_exact((c_in * taps).max(1)).enumerate() {
-        for (c, weight) in weight.chunks_exact(taps).enumerate() {
-            for (tap, &value) in weight.iter().enumerate() {
-                rows[((taps - 1 - tap) * c_out + o) * c_in + c] = value;
-            }
-        }
-    }
-    rows
-}
-
-/// A picture `[C, z, y, x]` to `[Z, Y, X, C]` with zeros around it.
-fn padded_channels_last(x: &[f32], channels: usize, window: &Window) -> Vec<f32> {
-    let (size, before, padded) = (window.input, window.padding, window.padded());
-    let mut out = vec![0.0; padded.iter().product::<usize>() * channels];
-    let cells = size.iter().product::<usize>();
-    for z in 0..size[0] {
-        for y in 0..size[1] {
-            let row = (before[0] + z) * padded[1] + before[1] + y;
-            let out = &mut out[(row * padded[2] + before[2]) * channels..];
-            transpose_row(&x[(z * size[1] + y) * size[2]..], cells, channels, size[2], channels, out);
-        }
-    }
-    out
-}
-
-/// The upstream gradient `[O, z, y, x]` spread by the stride into the reversed convolution's input `[Z, Y, X, O]`.
-///
-/// Cells that padding alone reaches lie outside and are left out.
-fn spread_channels_last(upstream: &[f32], channels: usize, window: &Window) -> Vec<f32> {
-    let (size, padded) = (window.output, window.reversed().input);
-    let mut out = vec![0.0; padded.iter().product::<usize>() * channels];
-    let cells = size.iter().product::<usize>();
-    // Output cell i meets input cell i·stride + tap - padding; in the reversed input it stands at i·stride + last tap - padding.
-    let place = |axis: usize, i: usize| {
-        let at = (i * window.stride[axis] + window.taps[axis] - 1).checked_sub(window.padding[axis])?;
-        (at < padded[axis]).then_some(at)
-    };
-    for z in 0..size[0] {
-        for y in 0..size[1] {
-            let (Some(z_at), Some(y_at)) = (place(0, z), place(1, y)) else { continue };
-            let inside = (0..size[2]).filter(|&x| place(2, x).is_some());
-            let (Some(first), count) = (inside.clone().next(), inside.count()) else { continue };
-            let Some(x_at) = place(2, first) else { continue };
-            let out = &mut out[((z_at * padded[1] + y_at) * padded[2] + x_at) * channels..];
-            let from = (z * size[1] + y) * size[2] + first;
-            transpose_row(&upstream[from..], cells, channels, count, window.stride[2] * channels, out);
-        }
-    }
-    out
-}
-
-/// Cells handled together when channels and cells change places, so that both sides stay in the cache.
-const TILE: usize = 16;
-
-/// Writes `count` cells of all channels (`x[c·pitch + i]`) to `out[i·step + c]`.
-fn transpose_row(x: &[f32], pitch: usize, channels: usize, count: usize, step: usize, out: &mut [f32]) {
-    for first in (0..count).step_by(TILE) {
-        let cells = TILE.min(count - first);
-        for c in 0..channels {
-            let x = &x[c * pitch + first..][..cells];
-            for (i, &value) in x.iter().enumerate() {
-                out[(first + i) * step + c] = value;
-            }
-        }
-    }
-}
-
-/// `[O, z, y, x]` to the output's scratch `[scratch cells, O]`, zeros in unused cells.
-fn to_scratch(upstream: &[f32], channels: usize, window: &Window) -> Vec<f32> {
-    let ([z_count, y_count, x_count], [row, slice]) = (window.output, window.scratch_pitch());
-    let mut scratch = vec![0.0; window.scratch_cells() * channels];
-    let cells = z_count * y_count * x_count;
-    for z in 0..z_count {
-        for y in 0..y_count {
-            let out = &mut scratch[(z * slice + y * row) * channels..];
-            transpose_row(&upstream[(z * y_count + y) * x_count..], cells, channels, x_count, channels, out);
-        }
-    }
-    scratch
-}
-
-/// The output's scratch to `[O, z, y, x]`, plus the bias.
-fn from_scratch(scratch: &[f32], channels: usize, window: &Window, bias: Option<&[f32]>, out: &mut [f32]) {
-    let ([z_count, y_count, x_count], [row, slice]) = (window.output, window.scratch_pitch());
-    let cells = z_count * y_count * x_count;
-    for z in 0..z_count {
-        for y in 0..y_count {
-            let from = &scratch[(z * slice + y * row) * channels..];
-            let at = (z * y_count + y) * x_count;
-            for first in (0..x_count).step_by(TILE) {
-                let count = TILE.min(x_count - first);
-                for c in 0..channels {
-                    let bias = bias.map_or(0.0, |bias| bias[c]);
-                    let out = &mut out[c * cells + at + first..][..count];
-                    for (i, out) in out.iter_mut().enumerate() {
-                        *out = from[(first + i) * channels + c] + bias;
-                    }
+    /// Where each run of each picture lies in the output: one piece per channel.
+    fn places<'a>(&self, runs: &[[usize; 2]], y: &'a mut Blank) -> Vec<Vec<&'a mut Blank>> {
+        let (cells, width) = (self.window.output.iter().product::<usize>(), self.window.output[2]);
+        let mut tasks = Vec::new();
+        for picture in y.chunks_exact_mut(cells * self.channels[1]) {
+            let first = tasks.len();
+            tasks.resize_with(first + runs.len(), || Vec::with_capacity(self.channels[1]));
+            for mut channel in picture.chunks_exact_mut(cells) {
+                for (task, [from, to]) in tasks[first..].iter_mut().zip(runs) {
+                    let (place, rest) = channel.split_at_mut((to - from) * width);
+                    task.push(place);
+                    channel = rest;
                 }
             }
         }
+        tasks
+    }
+
+    /// The scratch `[cells, O]` of the output's rows `first..last`.
+    fn scratch(&self, x: &[f32], first: usize, last: usize) -> Vec<f32> {
+        let (window, [c_in, c_out]) = (&self.window, self.channels);
+        let stretches = window.stretches_of(first, last);
+        let cells = stretches.last().map_or(0, |stretch| stretch.output + stretch.rows);
+        let mut scratch = vec![0.0; cells * c_out];
+        let row = window.taps[2] * c_in;
+        for stretch in stretches {
+            for (i, tap) in window.tap_rows().into_iter().enumerate() {
+                let inputs = Matrix {
+                    data: &x[(stretch.input + tap) * c_in..],
+                    rows: stretch.rows,
+                    columns: row,
+                    row_stride: window.stride[2] * c_in,
+                    column_stride: 1,
+                };
+                let weight = Matrix::row_major(&self.weight[i * row * c_out..], row, c_out);
+                let out = MatrixMut::row_major(&mut scratch[stretch.output * c_out..], stretch.rows, c_out);
+                product_on(Threads::One, out, inputs, weight, 1.0, if i == 0 { Old::Replaced } else { Old::Kept });
+            }
+        }
+        scratch
     }
 }

@@ -1,6 +1,7 @@
 //! Convolutions in two and three dimensions.
 
 mod kernel;
+mod layout;
 mod window;
 
 use burn::tensor::Tensor;

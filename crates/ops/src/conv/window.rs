@@ -63,17 +63,49 @@ impl Window {
 
     /// The stretches that cover the output: one for a dense convolution, else one per row.
     pub fn stretches(&self) -> Vec<Stretch> {
-        if self.dense() {
-            return vec![Stretch { output: 0, input: 0, rows: self.scratch_cells() }];
+        let rows = self.output[0] * self.output[1];
+        self.stretches_of(0, if self.output[2] == 0 { 0 } else { rows })
+    }
+
+    /// The stretches that cover the output's rows `first..last`, counted through all slices; places in the scratch relative to row `first`.
+    pub fn stretches_of(&self, first: usize, last: usize) -> Vec<Stretch> {
+        if first == last {
+            return Vec::new();
         }
-        let ([z, y, x], [_, padded_y, padded_x]) = (self.output, self.padded());
-        let rows = (0..z).flat_map(|z| (0..y).map(move |y| (z, y)));
-        rows.map(|(z_at, y_at)| Stretch {
-            output: (z_at * y + y_at) * x,
-            input: (z_at * self.stride[0] * padded_y + y_at * self.stride[1]) * padded_x,
-            rows: x,
-        })
-        .collect()
+        let start = self.scratch_row(first);
+        if self.dense() {
+            let rows = self.scratch_row(last - 1) + self.output[2] - start;
+            return vec![Stretch { output: 0, input: start, rows }];
+        }
+        let ([_, y_count, x_count], [_, padded_y, padded_x]) = (self.output, self.padded());
+        let stretch = |row: usize| {
+            let (z, y) = (row / y_count, row % y_count);
+            let input = (z * self.stride[0] * padded_y + y * self.stride[1]) * padded_x;
+            Stretch { output: self.scratch_row(row) - start, input, rows: x_count }
+        };
+        (first..last).map(stretch).collect()
+    }
+
+    /// First cell of an output row in the scratch.
+    pub fn scratch_row(&self, row: usize) -> usize {
+        let ([row_pitch, slice_pitch], y_count) = (self.scratch_pitch(), self.output[1]);
+        row / y_count * slice_pitch + row % y_count * row_pitch
+    }
+
+    /// Cuts the output's rows into runs of about `cells` cells. A run stays inside one slice, whose neighbours the scratch would hold unused
+    /// cells for, unless all slices together are smaller.
+    pub fn runs(&self, cells: usize) -> Vec<[usize; 2]> {
+        let [z_count, y_count, x_count] = self.output;
+        let rows = z_count * y_count;
+        if rows * x_count <= cells {
+            return vec![[0, rows]];
+        }
+        let length = (cells / x_count.max(1)).clamp(1, y_count);
+        let slice = |z: usize| {
+            let starts = (0..y_count).step_by(length);
+            starts.map(move |y| [z * y_count + y, z * y_count + (y + length).min(y_count)])
+        };
+        (0..z_count).flat_map(slice).collect()
     }
 
     /// For each tap along z and y: its cell in the padded input relative to a stretch's first.
@@ -96,6 +128,23 @@ mod tests {
         let halved = Window::new([1, 8, 7], [1, 3, 3], [1, 2, 2], [0, 1, 1]);
         assert_eq!(halved.output, [1, 4, 4]);
         assert_eq!(halved.stretches()[1], Stretch { output: 4, input: 2 * 9, rows: 4 });
+        assert_eq!(halved.stretches_of(1, 2), [Stretch { output: 0, input: 2 * 9, rows: 4 }]);
+        assert_eq!(same.stretches_of(2, 4), [Stretch { output: 0, input: 2 * 8, rows: 8 + 6 }]);
+    }
+
+    #[test]
+    fn runs_cover_every_row_once() {
+        let window = Window::new([3, 5, 7], [3; 3], [1; 3], [1; 3]);
+        assert_eq!(window.runs(1000), [[0, 15]]);
+        for cells in [1, 7, 20, 35] {
+            let runs = window.runs(cells);
+            assert!(runs.iter().all(|[first, last]| first / 5 == (last - 1) / 5), "{runs:?}");
+            assert!(
+                runs.windows(2).all(|pair| pair[0][1] == pair[1][0])
+                    && runs[0][0] == 0
+                    && runs[runs.len() - 1][1] == 15
+            );
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! From a kernel over slices to an operation on tensors with a gradient.
 
+use std::borrow::Cow;
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -21,8 +22,8 @@ pub(crate) trait Kernel<const N: usize>: Debug + Send + Sync + 'static {
     /// The output's values.
     fn forward(&self, inputs: [&[f32]; N]) -> Vec<f32>;
 
-    /// The gradients of the inputs that are wanted, given the output's.
-    fn backward(&self, inputs: [&[f32]; N], upstream: &[f32], wanted: [bool; N]) -> [Option<Vec<f32>>; N];
+    /// The gradients of the inputs that are wanted, given the output's, whose memory may serve for one of them where it is owned.
+    fn backward(&self, inputs: [&[f32]; N], upstream: Cow<'_, [f32]>, wanted: [bool; N]) -> [Option<Vec<f32>>; N];
 }
 
 /// Whether fused kernels take this tensor: f32 on the `flex` backend, with or without a tape.
@@ -164,8 +165,17 @@ impl<const N: usize> Backward<Flex, N> for FusedBackward<N> {
 
     fn backward(self, ops: Ops<Kept<N>, N>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         let Kept { kernel, inputs } = ops.state;
-        let upstream = contiguous(&[grads.consume::<Flex>(&ops.node)]);
-        let [upstream] = slices(&upstream);
+        let upstream = grads.consume::<Flex>(&ops.node);
+        // Two handles would make every gradient look shared.
+        let upstream = if upstream.is_contiguous() { upstream } else { upstream.to_contiguous() };
+        let shared;
+        let upstream = if upstream.is_unique() {
+            Cow::Owned(upstream.into_data().try_into_vec::<f32>().expect("an f32 tensor"))
+        } else {
+            shared = [upstream];
+            let [upstream] = slices(&shared);
+            Cow::Borrowed(upstream)
+        };
         let wanted = ops.parents.each_ref().map(|parent| parent.is_some());
         let gradients = kernel.backward(slices(&inputs), upstream, wanted);
         for ((parent, input), gradient) in ops.parents.into_iter().zip(&inputs).zip(gradients) {

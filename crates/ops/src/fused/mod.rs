@@ -1,12 +1,15 @@
 //! Fused kernels for the CPU backend `flex`: the machinery that makes one a differentiable tensor operation.
 
 mod dispatch;
+mod memory;
 mod simd;
 
 pub(crate) use dispatch::{Kernel, fused_1, fused_2, fused_3, on_flex};
+pub use memory::keep_freed_memory;
+pub(crate) use memory::{Blank, write_each, write_rows, written, written_in_parts};
+pub(crate) use simd::{exp_difference, largest, sum, sum_of_products, sum_of_squares, vectorized};
 #[cfg(target_arch = "x86_64")]
-pub(crate) use simd::has_avx512;
-pub(crate) use simd::{exp_difference, sum, sum_of_products, sum_of_squares, vectorized};
+pub(crate) use simd::{has_avx2, has_avx512};
 
 use std::cell::Cell;
 

@@ -1,40 +1,40 @@
 //! Vectorised inner loops without intrinsics.
 //!
 //! A loop over plain slices is compiled once per instruction set and the widest one the processor has is chosen at run
-//! time. Only additions and multiplications in a fixed order are used, never fused multiply-add, so that every
-//! instruction set gives the same bits.
+//! time. Additions and multiplications have a fixed order, and they are fused where the source says `mul_add` and nowhere
+//! else, so that every instruction set gives the same bits.
 
 /// Defines a function whose body is compiled for AVX-512, AVX2 and the portable baseline.
 ///
-/// `vectorized! { fn name[const C: usize](x: &[f32]) -> f32 { … } }`; the brackets hold const parameters and may be empty.
+/// `vectorized! { fn name[const C: usize](x: &[f32]) -> f32 { … } }`; the brackets hold a lifetime or const parameters and may be empty.
 macro_rules! vectorized {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident[$(const $param:ident: usize),*]($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?
+    ($(#[$meta:meta])* $vis:vis fn $name:ident[$($life:lifetime)? $(const $param:ident: usize),*]($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)?
      $body:block) => {
         $(#[$meta])*
         #[allow(unsafe_code)]
         #[allow(clippy::too_many_arguments)]
-        $vis fn $name<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+        $vis fn $name<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
             #[inline(always)]
             #[allow(clippy::too_many_arguments)]
-            fn body<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? $body
+            fn body<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? $body
 
             #[cfg(target_arch = "x86_64")]
             {
-                #[target_feature(enable = "avx2")]
+                #[target_feature(enable = "avx2,fma")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx2<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+                fn avx2<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
                     body::<$($param),*>($($arg),*)
                 }
                 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
                 #[allow(clippy::too_many_arguments)]
-                fn avx512<$(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
+                fn avx512<$($life,)? $(const $param: usize),*>($($arg: $ty),*) $(-> $ret)? {
                     body::<$($param),*>($($arg),*)
                 }
                 if $crate::fused::has_avx512() {
                     // SAFETY: the processor has just been found to have the enabled features.
                     return unsafe { avx512::<$($param),*>($($arg),*) };
                 }
-                if std::arch::is_x86_feature_detected!("avx2") {
+                if $crate::fused::has_avx2() {
                     // SAFETY: as above.
                     return unsafe { avx2::<$($param),*>($($arg),*) };
                 }
@@ -53,6 +53,13 @@ pub(crate) fn has_avx512() -> bool {
         && std::arch::is_x86_feature_detected!("avx512bw")
         && std::arch::is_x86_feature_detected!("avx512dq")
         && std::arch::is_x86_feature_detected!("avx512vl")
+}
+
+/// Whether the processor has AVX2 and fused multiplication and addition.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+pub(crate) fn has_avx2() -> bool {
+    std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma")
 }
 
 /// Partial sums of a reduction: four vectors of 8, so that long sums are not bound by the latency of one addition.
@@ -89,6 +96,27 @@ fn reduce(a: &[f32], b: &[f32], term: impl Fn(f32, f32) -> f32) -> f32 {
     ((a + e) + (b + f)) + ((c + g) + (d + h))
 }
 
+/// The largest element; NaN is passed over, and without any other element the result is -∞.
+#[inline(always)]
+pub(crate) fn largest(a: &[f32]) -> f32 {
+    let (long, rest) = a.as_chunks::<LANES>();
+    let mut lanes = [f32::NEG_INFINITY; LANES];
+    for block in long {
+        for i in 0..LANES {
+            lanes[i] = if block[i] > lanes[i] { block[i] } else { lanes[i] };
+        }
+    }
+    let mut length = LANES;
+    while length > SHORT {
+        length /= 2;
+        for i in 0..length {
+            lanes[i] = if lanes[i + length] > lanes[i] { lanes[i + length] } else { lanes[i] };
+        }
+    }
+    let rest = rest.iter().chain(&lanes[..SHORT]);
+    rest.fold(f32::NEG_INFINITY, |largest, &x| if x > largest { x } else { largest })
+}
+
 /// Sum of `a`.
 #[inline(always)]
 pub(crate) fn sum(a: &[f32]) -> f32 {
@@ -117,16 +145,16 @@ pub(crate) fn exp_difference(high: f32, low: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     const LN_2_HIGH: f32 = 0.693_359_4;
     const LN_2_LOW: f32 = -2.121_944_4e-4;
-    let shifted = high * std::f32::consts::LOG2_E + ROUND;
+    let shifted = high.mul_add(std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
-    let r = ((high - n * LN_2_HIGH) - n * LN_2_LOW) - low;
-    let mut p = 0.001_394_110_8;
-    p = p * r + 0.008_375_126;
-    p = p * r + 0.041_666_35;
-    p = p * r + 0.166_664_15;
-    p = p * r + 0.5;
-    p = p * r + 1.0;
-    p = p * r + 1.0;
+    let r = n.mul_add(-LN_2_LOW, n.mul_add(-LN_2_HIGH, high)) - low;
+    let mut p = 0.001_394_110_8_f32;
+    p = p.mul_add(r, 0.008_375_126);
+    p = p.mul_add(r, 0.041_666_35);
+    p = p.mul_add(r, 0.166_664_15);
+    p = p.mul_add(r, 0.5);
+    p = p.mul_add(r, 1.0);
+    p = p.mul_add(r, 1.0);
     let exponent = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32).wrapping_add(127);
     let scale = f32::from_bits((exponent << 23) as u32);
     // Written so that NaN fails the comparison and stays NaN.
@@ -157,6 +185,7 @@ mod tests {
             assert_eq!(sum(&a), expected as f32);
             let expected: usize = (0..length).map(|i| i * i).sum();
             assert_eq!(sum_of_products(&a, &a), expected as f32);
+            assert_eq!(largest(&a), a.last().copied().unwrap_or(f32::NEG_INFINITY));
         }
     }
 }

@@ -1,11 +1,15 @@
 //! Group norm, alone and followed by SiLU.
 
+use std::borrow::Cow;
+
 use burn::tensor::{Tensor, activation};
 use rayon::prelude::*;
 
 use super::moments;
 use crate::activation::{sigmoid, silu_slope};
-use crate::fused::{Kernel, fused_3, on_flex, sum, sum_of_products, vectorized};
+use crate::fused::{
+    Blank, Kernel, fused_3, on_flex, sum, sum_of_products, vectorized, write_each, write_rows, written,
+};
 use crate::mean_dim;
 
 /// Group norm: mean and variance over each group of channels and all positions, gain and bias per channel.
@@ -102,22 +106,26 @@ impl Kernel<3> for Group {
     }
 
     fn forward(&self, [x, gain, bias]: [&[f32]; 3]) -> Vec<f32> {
-        let mut y = vec![0.0; x.len()];
-        let rows = y.par_chunks_mut(self.row()).zip(x.par_chunks(self.row())).enumerate();
-        rows.for_each(|(row, (y, x))| {
-            let first = row % self.groups * self.depth();
-            forward_group(self, x, &gain[first..][..self.depth()], &bias[first..][..self.depth()], y);
-        });
-        y
-    }
-
-    fn backward(&self, [x, gain, bias]: [&[f32]; 3], upstream: &[f32], wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
-        let mut dx = vec![0.0; x.len()];
-        let rows = dx.par_chunks_mut(self.row()).zip(x.par_chunks(self.row())).zip(upstream.par_chunks(self.row()));
-        let parts = rows.enumerate().map(|(row, ((dx, x), upstream))| {
+        let length = self.row();
+        written(x.len(), length, |row, y| {
             let first = row % self.groups * self.depth();
             let (gain, bias) = (&gain[first..][..self.depth()], &bias[first..][..self.depth()]);
-            backward_group(self, x, gain, bias, upstream, dx)
+            forward_group(self, &x[row * length..][..length], gain, bias, y)
+        })
+    }
+
+    fn backward(
+        &self,
+        [x, gain, bias]: [&[f32]; 3],
+        upstream: Cow<'_, [f32]>,
+        wanted: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        let mut dx = upstream.into_owned();
+        let rows = dx.par_chunks_mut(self.row()).zip(x.par_chunks(self.row()));
+        let parts = rows.enumerate().map(|(row, (dx, x))| {
+            let first = row % self.groups * self.depth();
+            let (gain, bias) = (&gain[first..][..self.depth()], &bias[first..][..self.depth()]);
+            backward_group(self, x, gain, bias, dx)
         });
         let parts: Vec<Vec<[f32; 2]>> = parts.collect();
         // Summed over the batch in order.
@@ -134,31 +142,29 @@ impl Kernel<3> for Group {
 }
 
 vectorized! {
-    fn forward_group[](kernel: &Group, x: &[f32], gain: &[f32], bias: &[f32], y: &mut [f32]) {
+    fn forward_group['a](kernel: &Group, x: &[f32], gain: &[f32], bias: &[f32], y: &'a mut Blank) -> &'a mut [f32] {
         let (mean, variance) = moments(x, true);
         let scale = 1.0 / (variance + kernel.eps).sqrt();
-        let channels = y.chunks_exact_mut(kernel.area).zip(x.chunks_exact(kernel.area));
-        for ((y, x), (&gain, &bias)) in channels.zip(gain.iter().zip(bias)) {
-            for (y, &x) in y.iter_mut().zip(x) {
-                *y = (x - mean) * scale * gain + bias;
-            }
+        write_rows!(y, kernel.area, (j, y) => {
+            let (x, gain, bias) = (&x[j * kernel.area..][..kernel.area], gain[j], bias[j]);
+            let y = write_each!(y, x in x => (x - mean) * scale * gain + bias);
             if kernel.silu {
-                for y in y {
+                for y in y.iter_mut() {
                     *y *= sigmoid(*y);
                 }
             }
-        }
+            y
+        })
     }
 }
 
 vectorized! {
-    /// Fills `dx` and returns the gradients of (gain, bias) of the group's channels for this item.
+    /// Turns the upstream gradient into that of x, in place, and returns the gradients of (gain, bias) of the group's channels for this item.
     fn backward_group[](
         kernel: &Group,
         x: &[f32],
         gain: &[f32],
         bias: &[f32],
-        upstream: &[f32],
         dx: &mut [f32],
     ) -> Vec<[f32; 2]> {
         let (mean, variance) = moments(x, true);
@@ -169,10 +175,9 @@ vectorized! {
         for (j, parameters) in parameters.iter_mut().enumerate() {
             let range = j * kernel.area..(j + 1) * kernel.area;
             let dx = &mut dx[range.clone()];
-            for (normed, &x) in normed.iter_mut().zip(&x[range.clone()]) {
+            for (normed, &x) in normed.iter_mut().zip(&x[range]) {
                 *normed = (x - mean) * scale;
             }
-            dx.copy_from_slice(&upstream[range]);
             if kernel.silu {
                 for (dx, &normed) in dx.iter_mut().zip(&normed) {
                     *dx *= silu_slope(normed * gain[j] + bias[j]);

@@ -1,10 +1,15 @@
 //! Layer norm and RMS norm over the last axis.
 
+use std::borrow::Cow;
+
 use burn::tensor::Tensor;
 use rayon::prelude::*;
 
 use super::moments;
-use crate::fused::{Kernel, fused_1, fused_2, fused_3, on_flex, sum, sum_of_products, vectorized};
+use crate::fused::{
+    Blank, Kernel, fused_1, fused_2, fused_3, on_flex, sum, sum_of_products, vectorized, write_each, write_rows,
+    written,
+};
 use crate::mean_dim;
 
 /// Layer norm over the last axis: `(x - mean) / √(variance + eps) · gain + bias`, variance without Bessel's correction.
@@ -72,15 +77,15 @@ fn check_width<const R: usize>(x: &Tensor<R>, parameter: Option<&Tensor<1>>) {
 
 /// Inputs: x, then gain, then bias, as many as the operation has.
 #[derive(Debug)]
-struct LastAxis {
-    shape: Vec<usize>,
+pub(super) struct LastAxis {
+    pub shape: Vec<usize>,
     /// Whether the mean is subtracted.
-    centred: bool,
-    eps: f32,
+    pub centred: bool,
+    pub eps: f32,
 }
 
 /// Rows per task. Fixed, because the gradients of gain and bias are summed per task.
-const ROWS: usize = 64;
+pub(super) const ROWS: usize = 64;
 
 impl LastAxis {
     /// Width of a row, at least 1 so that empty tensors need no case of their own.
@@ -95,29 +100,19 @@ impl<const N: usize> Kernel<N> for LastAxis {
     }
 
     fn forward(&self, inputs: [&[f32]; N]) -> Vec<f32> {
-        let width = self.width();
+        let chunk = ROWS * self.width();
         let (gain, bias) = (inputs.get(1).copied(), inputs.get(2).copied());
-        let mut y = vec![0.0; inputs[0].len()];
-        let chunks = y.par_chunks_mut(ROWS * width).zip(inputs[0].par_chunks(ROWS * width));
-        chunks.for_each(|(y, x)| forward_rows(self, x, gain, bias, y));
-        y
+        written(inputs[0].len(), chunk, |i, y| forward_rows(self, &inputs[0][i * chunk..][..y.len()], gain, bias, y))
     }
 
-    fn backward(&self, inputs: [&[f32]; N], upstream: &[f32], wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
+    fn backward(&self, inputs: [&[f32]; N], upstream: Cow<'_, [f32]>, wanted: [bool; N]) -> [Option<Vec<f32>>; N] {
         let width = self.width();
         let gain = inputs.get(1).copied();
-        let mut dx = vec![0.0; inputs[0].len()];
+        let mut dx = upstream.into_owned();
         let chunks = dx.par_chunks_mut(ROWS * width).zip(inputs[0].par_chunks(ROWS * width));
-        let chunks = chunks.zip(upstream.par_chunks(ROWS * width));
-        let parts: Vec<_> = chunks.map(|((dx, x), upstream)| backward_rows(self, x, gain, upstream, dx)).collect();
+        let parts: Vec<_> = chunks.map(|(dx, x)| backward_rows(self, x, gain, dx)).collect();
         let mut gradients = [const { None }; N];
-        let totals = parts.into_iter().reduce(|mut total, part| {
-            for (total, part) in total.iter_mut().zip(part) {
-                *total += part;
-            }
-            total
-        });
-        let totals = totals.unwrap_or_else(|| vec![0.0; 2 * width]);
+        let totals = in_order(parts, 2 * width);
         for (i, (gradient, wanted)) in gradients.iter_mut().zip(wanted).enumerate() {
             *gradient = match i {
                 _ if !wanted => None,
@@ -129,57 +124,65 @@ impl<const N: usize> Kernel<N> for LastAxis {
     }
 }
 
+/// The sum of vectors of `length` numbers, one after another.
+pub(super) fn in_order(parts: Vec<Vec<f32>>, length: usize) -> Vec<f32> {
+    let sum = parts.into_iter().reduce(|mut total, part| {
+        total.iter_mut().zip(part).for_each(|(total, part)| *total += part);
+        total
+    });
+    sum.unwrap_or_else(|| vec![0.0; length])
+}
+
 vectorized! {
-    fn forward_rows[](kernel: &LastAxis, x: &[f32], gain: Option<&[f32]>, bias: Option<&[f32]>, y: &mut [f32]) {
+    pub(super) fn forward_rows['a](
+        kernel: &LastAxis,
+        x: &[f32],
+        gain: Option<&[f32]>,
+        bias: Option<&[f32]>,
+        y: &'a mut Blank,
+    ) -> &'a mut [f32] {
         let width = kernel.width();
-        for (y, x) in y.chunks_exact_mut(width).zip(x.chunks_exact(width)) {
+        write_rows!(y, width, (i, y) => {
+            let x = &x[i * width..][..width];
             let (mean, variance) = moments(x, kernel.centred);
             let scale = 1.0 / (variance + kernel.eps).sqrt();
-            for (y, &x) in y.iter_mut().zip(x) {
-                *y = (x - mean) * scale;
-            }
-            if let Some(gain) = gain {
-                for (y, &gain) in y.iter_mut().zip(gain) {
-                    *y *= gain;
+            match (gain, bias) {
+                (Some(gain), Some(bias)) => {
+                    write_each!(y, x in x, gain in gain, bias in bias => (x - mean) * scale * gain + bias)
                 }
+                (Some(gain), None) => write_each!(y, x in x, gain in gain => (x - mean) * scale * gain),
+                (None, _) => write_each!(y, x in x => (x - mean) * scale),
             }
-            if let Some(bias) = bias {
-                for (y, &bias) in y.iter_mut().zip(bias) {
-                    *y += bias;
-                }
-            }
-        }
+        })
     }
 }
 
 vectorized! {
-    /// Fills `dx` and returns the sums over these rows of the gradients of gain and bias, one after the other.
-    fn backward_rows[](kernel: &LastAxis, x: &[f32], gain: Option<&[f32]>, upstream: &[f32], dx: &mut [f32]) -> Vec<f32> {
+    /// Turns the upstream gradient into that of x, in place, and returns the sums over these rows of the gradients of gain and bias, one after
+    /// the other.
+    pub(super) fn backward_rows[](kernel: &LastAxis, x: &[f32], gain: Option<&[f32]>, gradient: &mut [f32]) -> Vec<f32> {
         let width = kernel.width();
         let mut parameters = vec![0.0; 2 * width];
         let (gain_sum, bias_sum) = parameters.split_at_mut(width);
         let mut normed = vec![0.0; width];
-        let rows = dx.chunks_exact_mut(width).zip(x.chunks_exact(width)).zip(upstream.chunks_exact(width));
-        for ((dx, x), upstream) in rows {
+        for (gradient, x) in gradient.chunks_exact_mut(width).zip(x.chunks_exact(width)) {
             let (mean, variance) = moments(x, kernel.centred);
             let scale = 1.0 / (variance + kernel.eps).sqrt();
             for (normed, &x) in normed.iter_mut().zip(x) {
                 *normed = (x - mean) * scale;
             }
-            for i in 0..width {
-                gain_sum[i] += upstream[i] * normed[i];
-                bias_sum[i] += upstream[i];
-            }
-            dx.copy_from_slice(upstream);
             if let Some(gain) = gain {
-                for (dx, &gain) in dx.iter_mut().zip(gain) {
-                    *dx *= gain;
+                let sums = gain_sum.iter_mut().zip(bias_sum.iter_mut());
+                for (((gradient, &normed), &gain), sums) in gradient.iter_mut().zip(&normed).zip(gain).zip(sums) {
+                    *sums.0 += *gradient * normed;
+                    *sums.1 += *gradient;
+                    *gradient *= gain;
                 }
             }
-            let along = sum_of_products(dx, &normed) / width as f32;
-            let shift = if kernel.centred { sum(dx) / width as f32 } else { 0.0 };
-            for (dx, &normed) in dx.iter_mut().zip(&normed) {
-                *dx = (*dx - shift - normed * along) * scale;
+            let along = sum_of_products(gradient, &normed) / width as f32;
+            let shift = if kernel.centred { sum(gradient) / width as f32 } else { 0.0 };
+            for (gradient, &normed) in gradient.iter_mut().zip(&normed) {
+                *gradient = (*gradient - shift - normed * along) * scale;
             }
         }
         parameters

@@ -2,11 +2,13 @@
 
 mod group;
 mod last_axis;
+mod modulated;
 
 use crate::fused::{sum, sum_of_squares};
 
 pub use group::{group_norm, group_norm_silu};
 pub use last_axis::{layer_norm, rms_norm};
+pub use modulated::modulated_layer_norm;
 
 /// Mean of `x` and of the squared distance from it (or from 0 where `centred` is false, with mean 0).
 ///

@@ -74,6 +74,10 @@ pub fn deformable_rays_3d(
             weights,
         },
     );
+    if r == 0 {
+        // To `reshape` a size of 0 means that of the same axis before.
+        return output.reshape([b, 0, v, m * c]).swap_dims(1, 2);
+    }
     output.reshape([b, v, r, m * c])
 }
 

@@ -3,6 +3,8 @@
 use burn::tensor::Tensor;
 
 use super::core::{Levels, Sampling, sample_views};
+use super::native::GridSampling;
+use crate::fused::{fused_2, on_flex};
 
 /// How a value between pixel centres is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,11 +25,19 @@ pub enum Interpolation {
 /// - output: `[N, C, Ho, Wo]`
 ///
 /// # Panics
-/// If the shapes disagree.
+/// If the shapes disagree or the input has no pixels.
 #[must_use]
 pub fn grid_sample_2d(input: Tensor<4>, grid: Tensor<4>, align_corners: bool, mode: Interpolation) -> Tensor<4> {
     let [n, c, h, w] = input.dims();
     let [_, ho, wo, axes] = grid.dims();
+    assert_eq!((grid.dims()[0], axes), (n, 2), "grid [N, Ho, Wo, 2]");
+    assert!(h * w > 0, "a map of {h}x{w}");
+    if on_flex(&input) && on_flex(&grid) {
+        let kernel = GridSampling { output_shape: vec![n, c, ho, wo], extent: [w, h, 1], axes, align_corners, mode };
+        // The nearest pixel does not move with the point.
+        let grid = if mode == Interpolation::Nearest { grid.detach() } else { grid };
+        return fused_2(kernel, input, grid);
+    }
     let levels = Levels::maps(&[[h, w]], 0.0);
     let pixels = pixels(grid.reshape([n, ho * wo, axes]), &levels, align_corners);
     let pixels = match mode {
@@ -45,11 +55,18 @@ pub fn grid_sample_2d(input: Tensor<4>, grid: Tensor<4>, align_corners: bool, mo
 /// - output: `[N, C, Do, Ho, Wo]`
 ///
 /// # Panics
-/// If the shapes disagree.
+/// If the shapes disagree or the input has no pixels.
 #[must_use]
 pub fn grid_sample_3d(input: Tensor<5>, grid: Tensor<5>) -> Tensor<5> {
     let [n, c, d, h, w] = input.dims();
     let [_, od, oh, ow, axes] = grid.dims();
+    assert_eq!((grid.dims()[0], axes), (n, 3), "grid [N, Do, Ho, Wo, 3]");
+    assert!(d * h * w > 0, "a volume of {d}x{h}x{w}");
+    if on_flex(&input) && on_flex(&grid) {
+        let (extent, mode) = ([w, h, d], Interpolation::Bilinear);
+        let kernel = GridSampling { output_shape: vec![n, c, od, oh, ow], extent, axes, align_corners: false, mode };
+        return fused_2(kernel, input, grid);
+    }
     let levels = Levels::volumes(&[[d, h, w]], 0.0);
     let pixels = pixels(grid.reshape([n, od * oh * ow, axes]), &levels, false);
     sample_pixels(&levels, input.reshape([n, c, d * h * w]), pixels).reshape([n, c, od, oh, ow])

@@ -23,6 +23,7 @@ pub fn run_main(command: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,wgpu=warn,cubecl=warn,naga=warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_target(false).with_writer(std::io::stderr).init();
+    ops::keep_freed_memory();
     match command() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

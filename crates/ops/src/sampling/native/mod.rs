@@ -6,6 +6,9 @@
 mod backward;
 mod batch;
 mod forward;
+mod grid;
+
+use std::borrow::Cow;
 
 use burn::tensor::{Bool, Tensor};
 
@@ -14,6 +17,7 @@ use crate::fused::{Kernel, fused_3};
 use super::core::{Levels, Sampling};
 
 use batch::{Batch, POINTS};
+pub(super) use grid::GridSampling;
 
 /// See [`super::core::sample_views`].
 pub(super) fn sample_views(levels: &Levels, sampling: Sampling) -> Tensor<3> {
@@ -203,8 +207,8 @@ impl Kernel<3> for Deformable {
         forward::forward(self, values, offsets, weights)
     }
 
-    fn backward(&self, inputs: [&[f32]; 3], upstream: &[f32], wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
-        backward::backward(self, inputs, upstream, wanted)
+    fn backward(&self, inputs: [&[f32]; 3], upstream: Cow<'_, [f32]>, wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
+        backward::backward(self, inputs, &upstream, wanted)
     }
 }
 
