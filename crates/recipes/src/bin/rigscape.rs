@@ -4,8 +4,9 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs, ShowDataArgs,
-    check_data, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
+    ChangeRigArgs, CheckDataArgs, EvaluateArgs, ImportArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs,
+    SampleArgs, ShowDataArgs, change_rig, check_data, evaluate, import, info, make_data, novel_view, reconstruct,
+    run_main, sample, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -22,9 +23,11 @@ enum Command {
     CheckData(CheckDataArgs),
     ShowData(ShowDataArgs),
     Evaluate(Box<EvaluateArgs>),
+    Import(ImportArgs),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
+    ChangeRig(ChangeRigArgs),
     Sample(SampleArgs),
 }
 
@@ -35,9 +38,11 @@ fn main() -> ExitCode {
         Command::CheckData(args) => check_data(args),
         Command::ShowData(args) => show_data(args),
         Command::Evaluate(args) => evaluate(args),
+        Command::Import(args) => import(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),
+        Command::ChangeRig(args) => change_rig(args),
         Command::Sample(args) => sample(args),
     })
 }
