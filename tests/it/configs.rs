@@ -29,6 +29,10 @@ fn shipped_configs_are_read_strictly_and_stay_short() {
     let mut found = Vec::new();
     files(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &mut found);
     assert!(found.len() >= 12, "{found:?}");
+    let experiments = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/experiments");
+    let mut of_benches = Vec::new();
+    files(&experiments, &mut of_benches);
+    found.extend(of_benches.into_iter().filter(|path| path.extension().is_some_and(|end| end == "toml")));
     for path in found {
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.starts_with('#'), "{}: open with what to expect", path.display());

@@ -10,7 +10,7 @@ pub fn rigscape(args: &[&str]) -> Output {
 }
 
 /// The message of a command that must fail, without a panic.
-fn refusal(output: Output) -> String {
+pub fn refusal(output: Output) -> String {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success(), "should have been refused: {text}");
     assert!(!text.contains("panicked"), "{text}");

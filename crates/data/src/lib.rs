@@ -35,6 +35,7 @@ mod procedural;
 mod procedural_cache;
 mod registry;
 mod resample;
+mod rig_file;
 mod sample;
 mod seeding;
 mod staging;
@@ -69,6 +70,7 @@ pub use nuscenes_writer::{Manifest, ManifestScene, NuScenesWriterConfig, write_n
 pub use pass::InOrder;
 pub use procedural::{Procedural, ProceduralConfig, RigSource};
 pub use registry::{DatasetConfig, open};
+pub use rig_file::read_rig;
 pub use sample::{ImageSize, PoseMode, Sample, SampleOptions, SampleView, rerig};
 pub use taxonomy::{ClassRule, ObjectClass};
 pub use waymo_writer::{WaymoManifest, WaymoManifestScene, WaymoWriterConfig, write_waymo};

@@ -3,7 +3,7 @@
 //! Nothing is stored: a frame is a pure function of the seed. Training and held-out sets differ by their seed only.
 
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use geometry::glam::DVec3;
@@ -18,7 +18,7 @@ use crate::procedural_cache::SceneCache;
 use crate::seeding::{Purpose, rng};
 use crate::{
     Capabilities, DataError, FrameId, FrameOutline, ImageSource, LocalMap, MapKind, ObjectBox, ObjectClass,
-    OccupancyGrid, OccupancyLabels, SceneDataset, SceneFrame, View,
+    OccupancyGrid, OccupancyLabels, SceneDataset, SceneFrame, View, read_rig,
 };
 
 /// Time stamp of the first scene's beginning; an arbitrary instant of 2020.
@@ -317,21 +317,4 @@ fn object_box(actor: &ActorState, ego_from_world: &Rigid) -> ObjectBox {
         visibility: None,
         interpolated: false,
     }
-}
-
-fn read_rig(path: &Path) -> Result<CameraRig, DataError> {
-    let text = std::fs::read_to_string(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => DataError::Missing { what: "camera rig".into(), path: path.into() },
-        _ => DataError::Io { action: "read", source, path: path.into() },
-    })?;
-    let rig: CameraRig =
-        serde_json::from_str(&text).map_err(|e| DataError::Json { why: e.to_string(), path: path.into() })?;
-    if rig.is_empty() {
-        return Err(DataError::Empty { what: "the camera rig".into(), path: path.into() });
-    }
-    for camera in &rig.cameras {
-        let row = camera.channel.clone();
-        camera.camera().map_err(|source| DataError::Calibration { row, source, path: path.into() })?;
-    }
-    Ok(rig)
 }

@@ -9,6 +9,7 @@ use crate::{GeometryError, Lens};
 
 /// Focal lengths, principal point and picture size, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Intrinsics {
     /// Horizontal focal length, px. Negative after a horizontal flip of the picture.
     pub fx: f64,

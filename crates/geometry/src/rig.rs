@@ -9,6 +9,7 @@ use crate::{Camera, GeometryError, Intrinsics, Lens, Rigid, wrap_angle};
 
 /// One camera on a vehicle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct RigCamera {
     /// The channel's name in its dataset.
     pub channel: String,
@@ -69,6 +70,7 @@ pub struct Adjacency {
 
 /// Ordered cameras of one vehicle; rigs are compared by value, never by a dataset's name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct CameraRig {
     /// The cameras in rig order.
     pub cameras: Vec<RigCamera>,

@@ -11,6 +11,7 @@ use crate::GeometryError;
 #[doc(alias = "SE3")]
 #[doc(alias = "cam_to_ego")]
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Rigid {
     /// Unit quaternion.
     pub rotation: DQuat,

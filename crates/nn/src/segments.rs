@@ -66,6 +66,12 @@ impl<const D: usize, const C: usize> Segments<D, C> {
         self.output.clone()
     }
 
+    /// What every block is told, without a tape.
+    #[must_use]
+    pub fn condition(&self) -> Tensor<C> {
+        self.condition.clone()
+    }
+
     /// Gradients of a loss from its gradient at [`Segments::output`] (without a tape); `blocks` and `run` as in the forward pass.
     pub fn backward<M: Module>(
         self,

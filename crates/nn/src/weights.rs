@@ -14,6 +14,7 @@ pub use error::{Mismatch, TorchFault, WeightError};
 pub use file::{WeightFile, write_text};
 pub use params::{fill_params, fill_some_params, load_strict, named_params, param_shapes};
 pub use safetensors_file::write_safetensors;
+pub use torch::{TensorGroup, torch_groups};
 
 /// A tensor on the host, row-major.
 #[derive(Debug, Clone, PartialEq)]

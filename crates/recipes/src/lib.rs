@@ -14,10 +14,11 @@ pub mod latents;
 mod loader_source;
 mod model_choice;
 mod reconstruction;
+pub mod rigs;
 pub mod sheet;
 pub mod show;
 pub mod tensors;
 mod trainer;
 
 pub use loader_source::LoaderSource;
-pub use model_choice::{AutoencoderSizes, Choice, ModelChoice, Sizes, UNetSizes};
+pub use model_choice::{AutoencoderSizes, Choice, ModelChoice, Sizes, UNetSizes, differences};

@@ -111,6 +111,32 @@ impl<P: Sizes> Serialize for Choice<P> {
     }
 }
 
+/// What differs between two configs, one line per key: `image.height = 64 instead of 256`.
+///
+/// # Errors
+/// A config that has no TOML form.
+pub fn differences<C: Serialize>(usual: &C, other: &C) -> Result<Vec<String>, toml::ser::Error> {
+    let mut lines = Vec::new();
+    collect_differences("", &Value::try_from(usual)?, &Value::try_from(other)?, &mut lines);
+    Ok(lines)
+}
+
+fn collect_differences(path: &str, usual: &Value, other: &Value, lines: &mut Vec<String>) {
+    match (usual, other) {
+        (Value::Table(usual), Value::Table(other)) => {
+            let absent = Value::String("none".to_owned());
+            let keys: std::collections::BTreeSet<&String> = usual.keys().chain(other.keys()).collect();
+            for key in keys {
+                let inner = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                let value = |table: &'_ Table| table.get(key).cloned().unwrap_or_else(|| absent.clone());
+                collect_differences(&inner, &value(usual), &value(other), lines);
+            }
+        }
+        (usual, other) if usual != other => lines.push(format!("{path} = {other} instead of {usual}")),
+        _ => {}
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use vae::Preset;
@@ -138,6 +164,17 @@ mod tests {
         assert_eq!(choice.config.resnets_per_level, 2);
         let error = toml::from_str::<Choice<AutoencoderSizes>>("preset = \"debug\"\nnorm_groups = 3").unwrap_err();
         assert!(error.to_string().contains("norm_groups 3 must divide"), "{error}");
+    }
+
+    #[test]
+    fn differences_name_every_key() {
+        let paper = Preset::Paper.config();
+        assert!(differences(&paper, &paper).unwrap().is_empty());
+        let mut other = paper.clone();
+        other.image.heads = 6;
+        other.grid.cells[0] = 4;
+        let lines = differences(&paper, &other).unwrap();
+        assert_eq!(lines, ["grid.cells = [4, 128, 128] instead of [8, 128, 128]", "image.heads = 6 instead of 12"]);
     }
 
     #[test]

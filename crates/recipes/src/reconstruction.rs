@@ -12,10 +12,14 @@ use rand::RngExt;
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
 use train::StepOutput;
-use vae::losses::{adaptive_weight, adversarial, hinge_discriminator, masked_l2, select_views, with_ignored_pixels_of};
+use vae::losses::{
+    adaptive_weight, adversarial, hinge_discriminator, lecam, masked_l2, select_views, squared_slope,
+    with_ignored_pixels_of,
+};
 
-use crate::adversary::Adversary;
+use crate::adversary::{Adversary, Smoothing};
 use crate::bev_vae::Perceptual;
+use crate::tensors::normal;
 
 /// What should have been painted, and which of it counts.
 pub(crate) struct Target {
@@ -29,20 +33,40 @@ pub(crate) struct Target {
     pub present: Vec<bool>,
 }
 
-/// What was painted, on the tape.
+/// What was painted, and the way back through the generator.
 pub(crate) struct Painted<'a> {
-    /// `[B, V, 3, H, W]`, network values.
+    /// `[B, V, 3, H, W]`, network values, without a tape.
     pub images: Tensor<5>,
-    /// Mean over samples, `[1]`.
+    /// Mean over samples, `[1]`, without a tape.
     pub kl: Tensor<1>,
     /// Norm of a loss's gradient over the last layer's weight, from its gradient over the pictures.
     pub last_layer_norm: &'a dyn Fn(&Tensor<5>) -> Tensor<1>,
+    /// Gradients of the generator from a loss's gradient over the pictures and the weight of the KL term.
+    pub way_back: Box<dyn FnOnce(Tensor<5>, f64) -> GradientsParams + 'a>,
+}
+
+impl<'a> Painted<'a> {
+    /// Pictures and KL term that `model` computed on one tape.
+    pub fn on_tape<M: Module>(
+        model: &'a M,
+        (images, kl): (Tensor<5>, Tensor<1>),
+        last_layer_norm: &'a dyn Fn(&Tensor<5>) -> Tensor<1>,
+    ) -> Self {
+        let (seen, value) = (images.clone().inner(), kl.clone().inner());
+        let way_back = Box::new(move |upstream: Tensor<5>, kl_weight: f64| {
+            let total = (images * Tensor::from_inner(upstream)).sum() + kl * kl_weight;
+            GradientsParams::from_grads(total.backward(), model)
+        });
+        Self { images: seen, kl: value, last_layer_norm, way_back }
+    }
 }
 
 /// Gradients of one micro batch.
 pub(crate) struct StepGradients {
     pub generator: GradientsParams,
     pub discriminator: Option<GradientsParams>,
+    /// Mean scores of real and painted pictures, where there is a discriminator.
+    pub scores: Option<[Tensor<1>; 2]>,
 }
 
 /// The losses of one step.
@@ -54,19 +78,18 @@ pub(crate) struct Losses<'a> {
 
 impl Losses<'_> {
     /// Gradients of everything that learns; `views` draws the views that parts of the loss look at.
-    pub fn gradients<M: Module>(
+    pub fn gradients(
         &self,
-        model: &M,
         painted: Painted,
         target: &Target,
         views: &mut ChaCha8Rng,
         output: &mut StepOutput,
     ) -> StepGradients {
-        let images = painted.images.clone().inner();
+        let images = painted.images;
         let (reconstruction, mut upstream) = self.reconstruction_gradient(&images, target, views);
         output.push("loss", reconstruction + painted.kl.clone() * self.kl_weight);
         output.push("kl", painted.kl.clone());
-        let mut discriminator = None;
+        let (mut discriminator, mut scores) = (None, None);
         if let Some(adversary) = &self.adversary {
             let positions = choose_views(&target.present, adversary.views, views);
             if adversary.weight > 0.0 {
@@ -77,13 +100,14 @@ impl Losses<'_> {
                 output.push("lambda", lambda);
                 output.push("adversarial", score);
             }
-            let (loss, gradients) = discriminator_gradients(adversary, images, target, &positions);
-            output.push("discriminator", loss);
-            discriminator = Some(gradients);
+            let judged = discriminator_gradients(adversary, images, target, &positions, views);
+            output.push("discriminator", judged.loss);
+            if let Some(smoothing) = judged.smoothing {
+                output.push("discriminator_smoothing", smoothing);
+            }
+            (discriminator, scores) = (Some(judged.gradients), Some(judged.scores));
         }
-        let total = (painted.images * Tensor::from_inner(upstream)).sum() + painted.kl * self.kl_weight;
-        let generator = GradientsParams::from_grads(total.backward(), model);
-        StepGradients { generator, discriminator }
+        StepGradients { generator: (painted.way_back)(upstream, self.kl_weight), discriminator, scores }
     }
 
     /// L_R and its gradient at the painted pictures.
@@ -128,20 +152,49 @@ fn adversarial_gradient(
     (leaf.grad(&gradients).expect("the score depends on the painted pictures"), value)
 }
 
-/// L_D on real and painted pictures and its gradients.
+/// What a discriminator's step comes to.
+struct Judged {
+    /// L_D alone.
+    loss: Tensor<1>,
+    /// What keeps it smooth, where that is part of the step.
+    smoothing: Option<Tensor<1>>,
+    /// Mean scores of real and painted pictures.
+    scores: [Tensor<1>; 2],
+    gradients: GradientsParams,
+}
+
+/// L_D on real and painted pictures and its gradients; `directions` draws where slopes are measured.
 fn discriminator_gradients(
     adversary: &Adversary,
     images: Tensor<5>,
     target: &Target,
     positions: &[usize],
-) -> (Tensor<1>, GradientsParams) {
+    directions: &mut ChaCha8Rng,
+) -> Judged {
     let n = positions.len();
     let fake = select_views(target.fill_ignored(Tensor::from_inner(images)), positions);
     let real = select_views(target.images.clone(), positions);
-    let scores = adversary.discriminator.forward(Tensor::cat(vec![real, fake], 0));
-    let loss = hinge_discriminator(scores.clone().narrow(0, 0, n), scores.narrow(0, n, n));
-    let value = loss.clone().inner();
-    (value, GradientsParams::from_grads(loss.backward(), adversary.discriminator))
+    let scores = adversary.discriminator.forward(Tensor::cat(vec![real.clone(), fake], 0));
+    let [on_real, on_fake] = [0, n].map(|start| scores.clone().narrow(0, start, n));
+    let loss = hinge_discriminator(on_real.clone(), on_fake.clone());
+    let smoothing = match adversary.smoothing {
+        Smoothing::Nothing => None,
+        Smoothing::Slope { factor, epsilon } => {
+            let along = normal(real.dims(), directions, &real.device());
+            Some(squared_slope(|x| adversary.discriminator.forward(x), real, along, epsilon) * factor)
+        }
+        Smoothing::Lecam { weight, means } => Some(lecam(on_real.clone(), on_fake.clone(), means) * weight),
+    };
+    let total = match &smoothing {
+        Some(smoothing) => loss.clone() + smoothing.clone(),
+        None => loss.clone(),
+    };
+    Judged {
+        loss: loss.inner(),
+        smoothing: smoothing.map(Tensor::inner),
+        scores: [on_real, on_fake].map(|scores| scores.mean().inner()),
+        gradients: GradientsParams::from_grads(total.backward(), adversary.discriminator),
+    }
 }
 
 /// Positions of `count` random cameras that exist (all of them for 0), ascending.

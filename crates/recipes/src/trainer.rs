@@ -109,9 +109,11 @@ impl<M: Module + Sync> Trainer<M> {
         });
         let mut output = StepOutput::new(0);
         let (mut generator, mut discriminator) = (GradientMean::default(), GradientMean::default());
+        let mut scores = Vec::new();
         for (gradients, part) in parts {
             output.append(part);
             generator.add(&self.model, gradients.generator);
+            scores.extend(gradients.scores);
             if let (Some(state), Some(gradients)) = (adversary, gradients.discriminator) {
                 discriminator.add(state.discriminator(), gradients);
             }
@@ -126,6 +128,7 @@ impl<M: Module + Sync> Trainer<M> {
         output.push("learning_rate", update.learning_rate);
         if let Some(state) = self.adversary.as_mut().filter(|state| state.learns(ctx)) {
             let gradients = discriminator.take(state.discriminator());
+            state.remember(&scores);
             state.update(gradients, ctx, &mut output)?;
         }
         Ok(output)

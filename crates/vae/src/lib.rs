@@ -11,10 +11,12 @@ pub mod pyramid;
 pub mod sample_points;
 pub mod scene_decoder;
 pub mod scene_encoder;
+mod segmented;
 pub mod state_coder;
 
 pub use config::{BevVaeConfig, ConfigError, ImageConfig, Preset, SceneConfig, StateConfig};
 pub use discriminator::Discriminator;
 pub use model::{BevVae, Decoded, Decoder, Encoder};
 pub use sample_points::{SamplePoints, ViewMatrices};
+pub use segmented::{OnBoth, SegmentedPass};
 pub use state_coder::{DiagonalGaussian, latent_picture, latent_tokens};

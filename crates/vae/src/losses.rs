@@ -49,6 +49,31 @@ pub fn hinge_discriminator(real: Tensor<1>, fake: Tensor<1>) -> Tensor<1> {
     relu(1.0 - real).mean() + relu(fake + 1.0).mean()
 }
 
+/// First-order substitute for R1: the mean squared slope of the score along random directions, by central differences. For directions
+/// v ~ N(0, I) its expectation is the mean of ‖∇D‖² up to O(ε²) (item 5.2).
+///
+/// # Shapes
+/// - images, directions: `[N, 3, H, W]`
+/// - output: `[1]`
+pub fn squared_slope(
+    score: impl Fn(Tensor<4>) -> Tensor<1>,
+    images: Tensor<4>,
+    directions: Tensor<4>,
+    epsilon: f64,
+) -> Tensor<1> {
+    let n = images.dims()[0];
+    let step = directions * epsilon;
+    let scores = score(Tensor::cat(vec![images.clone() + step.clone(), images - step], 0));
+    let slope = (scores.clone().narrow(0, 0, n) - scores.narrow(0, n, n)) / (2.0 * epsilon);
+    slope.square().mean()
+}
+
+/// LeCam regulariser: mean (D(x) − a_F)² + mean (D(x̂) − a_R)² with the running means a_R, a_F of the scores of real and painted
+/// pictures (item 5.2; Tseng et al., "Regularizing Generative Adversarial Networks under Limited Data", equation 4).
+pub fn lecam(real: Tensor<1>, fake: Tensor<1>, [mean_real, mean_fake]: [f64; 2]) -> Tensor<1> {
+    (real - mean_fake).square().mean() + (fake - mean_real).square().mean()
+}
+
 /// Adversarial loss of the generator: −mean D(x̂) (item 6).
 pub fn adversarial(fake: Tensor<1>) -> Tensor<1> {
     -fake.mean()

@@ -32,6 +32,8 @@ pub(super) struct Entry {
 pub(super) struct Contents {
     pub tensors: BTreeMap<String, Entry>,
     pub metadata: BTreeMap<String, String>,
+    /// Names as they follow each other in the file.
+    pub order: Vec<String>,
     pub others: Vec<String>,
 }
 
@@ -58,7 +60,8 @@ impl WeightFile {
         Self::open_with(path.as_ref(), None)
     }
 
-    /// Opens the state dict that a torch file holds under these keys, outermost first: `&["model", "ema"]`.
+    /// Opens the dictionary or list that a torch file holds under these keys, outermost first: `&["model", "ema"]`. Items of a list
+    /// are called by their position, `0`, `1` and so on.
     ///
     /// # Errors
     /// As [`WeightFile::open`], and [`WeightError::Layout`] for a safetensors file, which has no nesting.
@@ -88,6 +91,7 @@ impl WeightFile {
         if !tensors.is_empty() && tensors.keys().all(|name| name.starts_with(prefix)) {
             let shorter = |(name, entry): (String, Entry)| (name[prefix.len()..].to_owned(), entry);
             *tensors = std::mem::take(tensors).into_iter().map(shorter).collect();
+            self.contents.order.iter_mut().for_each(|name| *name = name.split_off(prefix.len()));
         }
         self
     }
@@ -107,6 +111,11 @@ impl WeightFile {
     /// Names of all tensors, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.contents.tensors.keys().map(String::as_str)
+    }
+
+    /// Names of all tensors as they follow each other in the file.
+    pub fn names_in_order(&self) -> impl Iterator<Item = &str> {
+        self.contents.order.iter().map(String::as_str)
     }
 
     /// Names in the state dict of a torch file that hold something else than a dense tensor.

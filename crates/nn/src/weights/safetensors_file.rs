@@ -45,8 +45,13 @@ pub(super) fn read(file: &mut File, path: &Path) -> Result<Contents, WeightError
         span: info.shape.iter().product(),
         strides: None,
     };
+    let tensors: BTreeMap<String, Entry> =
+        parsed.tensors().into_iter().map(|(name, info)| (name, entry(info))).collect();
+    let mut order: Vec<(u64, String)> = tensors.iter().map(|(name, entry)| (entry.start, name.clone())).collect();
+    order.sort();
     Ok(Contents {
-        tensors: parsed.tensors().into_iter().map(|(name, info)| (name, entry(info))).collect(),
+        tensors,
+        order: order.into_iter().map(|(_, name)| name).collect(),
         metadata: parsed.metadata().clone().unwrap_or_default().into_iter().collect(),
         others: Vec::new(),
     })

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nn::weights::{HostTensor, TorchFault, WeightError, WeightFile};
+use nn::weights::{HostTensor, TensorGroup, TorchFault, WeightError, WeightFile, torch_groups};
 
 pub fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
@@ -69,7 +69,25 @@ fn a_nested_state_dict_is_found_by_its_keys() {
     let inner = WeightFile::open_nested(fixture("several.pt"), &["model", "inner"]).unwrap();
     assert_eq!(inner.tensor("w").unwrap().data, [2.0]);
     let error = WeightFile::open_nested(fixture("several.pt"), &["model", "outer"]).unwrap_err().to_string();
-    assert!(error.contains("no dictionary under model/outer; there are ema, model, net"), "{error}");
+    assert!(error.contains("no dictionary or list under model/outer; there are ema, model, net"), "{error}");
+}
+
+#[test]
+fn every_place_of_tensors_is_listed_and_opens() {
+    let path = fixture("lightning.ckpt");
+    let groups = torch_groups(&path).unwrap();
+    let place = |group: &TensorGroup| group.keys.join("/");
+    let expected =
+        ["state_dict", "optimizer_states/0/state/0", "optimizer_states/0/state/1", "callbacks/__main__.Node"];
+    assert_eq!(groups.iter().map(place).collect::<Vec<_>>(), expected);
+    assert_eq!(groups[0].names, ["matcher.weight", "matcher.bias"], "the order of the file");
+    for group in &groups {
+        let keys: Vec<&str> = group.keys.iter().map(String::as_str).collect();
+        let file = WeightFile::open_nested(&path, &keys).unwrap();
+        assert!(file.names_in_order().eq(group.names.iter().map(String::as_str)) && !group.is_list);
+    }
+    let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml");
+    assert!(matches!(torch_groups(own), Err(WeightError::Layout { .. })));
 }
 
 fn fault(name: &str) -> TorchFault {

@@ -35,12 +35,9 @@ impl Step<'_> {
         let features = features.inner();
         let last_layer_norm =
             |gradient: &Tensor<5>| weight_gradient_norm(last, &features, gradient.clone().reshape([n, c, h, w]));
-        let painted = Painted {
-            images: painted.reshape([1, n, c, h, w]),
-            kl: posterior.kl().mean(),
-            last_layer_norm: &last_layer_norm,
-        };
-        (self.losses.gradients(self.model, painted, &target, &mut views, &mut output), output)
+        let found = (painted.reshape([1, n, c, h, w]), posterior.kl().mean());
+        let painted = Painted::on_tape(self.model, found, &last_layer_norm);
+        (self.losses.gradients(painted, &target, &mut views, &mut output), output)
     }
 
     /// The pictures as they are shown, `[N, 3, H, W]`, and what shall be painted, as one rig of N views.

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::bail;
 use data::{DatasetConfig, LoaderConfig, MixtureConfig};
 use features::Tap;
 use serde::{Deserialize, Serialize};
@@ -18,6 +19,12 @@ pub struct Experiment {
     /// Where to compute.
     #[serde(default)]
     pub device: DeviceConfig,
+    /// Run or checkpoint folder whose averaged weights the network starts from; fresh weights without it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init_from: Option<PathBuf>,
+    /// Computes every block again on the way back instead of keeping what it computed: less memory, about a third more time.
+    #[serde(default)]
+    pub checkpointing: bool,
     /// Where results go.
     pub run: RunConfig,
     /// Sizes of the network.
@@ -145,11 +152,97 @@ pub struct HingeConfig {
     pub views: usize,
     /// Channels at full resolution; 0 for the preset's.
     pub channels: usize,
+    /// What keeps it smooth.
+    pub regulariser: Regulariser,
+}
+
+/// What keeps the discriminator smooth (section 5.2 of the specification).
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Regulariser {
+    /// Nothing.
+    #[default]
+    None,
+    /// Small slopes at real pictures: R1 without a second derivative.
+    R1FiniteDifference(SlopeConfig),
+    /// Scores near the running means of the other side.
+    Lecam(LecamConfig),
+}
+
+/// Settings of the substitute for R1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SlopeConfig {
+    /// γ: the term is γ/2 times the mean squared slope.
+    pub gamma: f64,
+    /// Half the distance of the two looks, network values.
+    pub epsilon: f64,
+    /// Taken in every so many steps, as many times stronger.
+    pub every: u64,
+}
+
+impl Default for SlopeConfig {
+    fn default() -> Self {
+        Self { gamma: 10.0, epsilon: 0.01, every: 16 }
+    }
+}
+
+/// Settings of LeCam.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LecamConfig {
+    /// Factor on the term.
+    pub weight: f64,
+    /// Share of the old mean in each step.
+    pub decay: f64,
+}
+
+impl Default for LecamConfig {
+    fn default() -> Self {
+        Self { weight: 1e-3, decay: 0.99 }
+    }
+}
+
+impl HingeConfig {
+    /// Refuses numbers without a meaning.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn checked(&self) -> anyhow::Result<&Self> {
+        let shares = [("discriminator_start", self.discriminator_start), ("generator_start", self.generator_start)];
+        if let Some((name, value)) = shares.into_iter().find(|(_, share)| !(share.is_finite() && *share >= 0.0)) {
+            bail!("loss.adversarial.hinge.{name} = {value}: needs a share of the run from 0");
+        }
+        if self.generator_start < self.discriminator_start {
+            bail!(
+                "loss.adversarial.hinge.generator_start = {} lies before discriminator_start = {}: a discriminator that has not learned \
+                 cannot teach",
+                self.generator_start,
+                self.discriminator_start
+            );
+        }
+        match self.regulariser {
+            Regulariser::R1FiniteDifference(SlopeConfig { epsilon, every, .. }) if every == 0 || !(epsilon > 0.0) => {
+                bail!("loss.adversarial.hinge.regulariser: every ({every}) and epsilon ({epsilon}) must be above 0")
+            }
+            Regulariser::Lecam(LecamConfig { decay, .. }) if !(0.0..1.0).contains(&decay) => {
+                bail!("loss.adversarial.hinge.regulariser.lecam.decay = {decay}: needs a share from 0 to below 1")
+            }
+            _ => Ok(self),
+        }
+    }
 }
 
 impl Default for HingeConfig {
     fn default() -> Self {
-        Self { weight: 0.1, discriminator_start: 0.05, generator_start: 0.06, views: 0, channels: 0 }
+        Self {
+            weight: 0.1,
+            discriminator_start: 0.05,
+            generator_start: 0.06,
+            views: 0,
+            channels: 0,
+            regulariser: Regulariser::None,
+        }
     }
 }
 

@@ -4,8 +4,9 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, EncodeArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs,
-    ShowDataArgs, check_data, encode, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
+    ChangeRigArgs, CheckDataArgs, EncodeArgs, EvaluateArgs, ImportArgs, InfoArgs, MakeDataArgs, NovelViewArgs,
+    ReconstructArgs, SampleArgs, ShowDataArgs, change_rig, check_data, encode, evaluate, import, info, make_data,
+    novel_view, reconstruct, run_main, sample, show_data,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -23,9 +24,11 @@ enum Command {
     ShowData(ShowDataArgs),
     Encode(Box<EncodeArgs>),
     Evaluate(Box<EvaluateArgs>),
+    Import(ImportArgs),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
+    ChangeRig(ChangeRigArgs),
     Sample(SampleArgs),
 }
 
@@ -37,9 +40,11 @@ fn main() -> ExitCode {
         Command::ShowData(args) => show_data(args),
         Command::Encode(args) => encode(args),
         Command::Evaluate(args) => evaluate(args),
+        Command::Import(args) => import(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),
+        Command::ChangeRig(args) => change_rig(args),
         Command::Sample(args) => sample(args),
     })
 }

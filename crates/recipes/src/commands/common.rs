@@ -147,6 +147,12 @@ impl LoadedModel {
     /// The datasets asked for, or the experiment's held-out ones.
     pub fn datasets(&self, args: &DataArgs) -> anyhow::Result<Vec<Arc<dyn SceneDataset>>> {
         let asked = args.configs()?;
-        open_all(if asked.is_empty() { &self.experiment.data.validation } else { &asked })
+        let configs = if asked.is_empty() { &self.experiment.data.validation } else { &asked };
+        if configs.is_empty() {
+            return Err(UsageError::of(
+                "the checkpoint names no held-out data; say which with --data FILE or --nuscenes DIR",
+            ));
+        }
+        open_all(configs)
     }
 }

@@ -1,6 +1,7 @@
 //! `rigscape evaluate`: pictures against pictures, every number with its protocol.
 
 mod labels;
+mod reports;
 mod sides;
 mod statistics;
 
@@ -10,18 +11,19 @@ use std::time::Instant as Clock;
 
 use anyhow::{Context, bail};
 use clap::Parser;
-use metrics::Protocol;
+use metrics::{NovelViewSummary, Protocol};
 use sha2::{Digest, Sha256};
 use train::{DeviceConfig, head_commit};
 
 use self::labels::labels;
-use self::sides::{Sides, model, painted, stored};
+use self::reports::{Evaluated, write_reports};
+use self::sides::{Sides, model, novel_views, painted, stored};
 use self::statistics::{replaced, save_statistics};
 use super::common::{DataArgs, LoadedModel, UsageError, say};
+use super::views::parse_angle;
 use crate::evaluate::{
-    NetworkFolder, Pass, PassOptions, PictureSource, Report, Side, draw_report, needs_pairs, numbers, write_file,
+    NetworkFolder, Pass, PassOptions, PictureSource, Report, Side, draw_report, needs_pairs, numbers,
 };
-use crate::sheet::save_picture;
 
 /// Compare two sets of pictures, or a checkpoint's reconstructions with what it was shown, by named protocols
 #[derive(Debug, Parser)]
@@ -51,6 +53,10 @@ pub struct EvaluateArgs {
     /// With both: the W-CODA score, from this Frechet video distance of the same pictures
     #[arg(long, value_name = "FVD", requires = "detections", requires = "segmentation")]
     pub wcoda_fvd: Option<f64>,
+    /// Turns of the rig for views that no camera took, degrees, for --checkpoint; where the data can render their truth [default: the
+    /// experiment's]
+    #[arg(long, value_name = "DEG", value_delimiter = ',', allow_hyphen_values = true, requires = "checkpoint", value_parser = parse_angle)]
+    pub yaw: Vec<f64>,
     /// Data for --checkpoint [default: the experiment's held-out data], --detections and --segmentation
     #[command(flatten)]
     pub data: DataArgs,
@@ -112,6 +118,8 @@ fn parse_size(text: &str) -> Result<[usize; 2], String> {
     }
 }
 
+/// Consistency of neighbouring views, for models that paint whole rigs.
+const RIG_DEFAULT: &str = "mvsc/v1";
 /// Protocols of pairs that need no weights.
 const PAIR_DEFAULTS: [&str; 3] = ["psnr/bev-vae", "ssim/skimage7", "ssim/gauss11"];
 /// Protocol of sets that any folder fits.
@@ -138,14 +146,19 @@ pub fn evaluate(args: &EvaluateArgs) -> anyhow::Result<()> {
         Some(path) => {
             let loaded = LoadedModel::open(path, args.device)?;
             let networks = NetworkFolder { folders, device: loaded.device.clone() };
+            let mut reports = Vec::new();
             for dataset in loaded.datasets(&args.data)? {
-                run(args, &protocols, &networks, painted(&loaded, &dataset, args.frames), model(path))?;
+                let sides = painted(&loaded, &dataset, args.frames);
+                let novel = || novel_views(&loaded, &dataset, &args.yaw, args.frames);
+                reports.extend(run(args, &protocols, &networks, sides, (model(path), &novel))?);
             }
-            Ok(())
+            write_reports(args.out.as_deref(), &reports)
         }
         None => {
             let device = args.device.unwrap_or_default().open()?;
-            run(args, &protocols, &NetworkFolder { folders, device }, stored(args)?, BTreeMap::new())
+            let networks = NetworkFolder { folders, device };
+            let evaluated = run(args, &protocols, &networks, stored(args)?, (BTreeMap::new(), &|| Ok(Vec::new())))?;
+            write_reports(args.out.as_deref(), evaluated.as_slice())
         }
     }
 }
@@ -179,6 +192,7 @@ fn chosen(args: &EvaluateArgs, known: &[Protocol], has_weights: bool) -> anyhow:
     if names.is_empty() {
         names.extend(PAIR_DEFAULTS.iter().filter(|_| !alone));
         names.extend([SET_DEFAULT].iter().filter(|_| has_weights || alone));
+        names.extend([RIG_DEFAULT].iter().filter(|_| has_weights && args.checkpoint.is_some()));
     }
     let one = |name: &&str| {
         let found = known.iter().find(|protocol| protocol.name == **name).cloned();
@@ -203,8 +217,8 @@ fn run(
     protocols: &[Protocol],
     networks: &NetworkFolder,
     (real, generated): Sides<'_>,
-    model: BTreeMap<String, String>,
-) -> anyhow::Result<()> {
+    (model, novel_views): (BTreeMap<String, String>, &dyn Fn() -> anyhow::Result<Vec<NovelViewSummary>>),
+) -> anyhow::Result<Option<Evaluated>> {
     let clock = Clock::now();
     let options = PassOptions {
         protocols: protocols.to_vec(),
@@ -229,8 +243,9 @@ fn run(
         save_statistics(path, args, &pass, &*generated, &frames_sha256)?;
     }
     if real.is_none() && args.real_stats.is_none() {
-        return Ok(());
+        return Ok(None);
     }
+    let novel_views = novel_views()?;
     let report = Report {
         code: code_version(),
         real: real.as_ref().map_or_else(|| describe_file(args.real_stats.as_deref()), |real| real.describe()),
@@ -243,14 +258,13 @@ fn run(
         seed: args.seed,
         size: args.size,
         metrics: numbers(&pass, protocols, &replaced, args.seed)?,
+        novel_views,
         wall_seconds: clock.elapsed().as_secs_f64(),
     };
     say(report.markdown())?;
-    let Some(out) = &args.out else { return Ok(()) };
-    write_file(&out.join("report.json"), serde_json::to_string_pretty(&report)?.as_bytes())?;
-    write_file(&out.join("report.md"), report.markdown().as_bytes())?;
     let sides = real.as_ref().filter(|_| !args.unpaired).map(|real| (&**real, &*generated));
-    save_picture(&draw_report(&report, &pass.scalars, sides)?, &out.join("report.png"))
+    let picture = args.out.as_ref().map(|_| draw_report(&report, &pass.scalars, sides)).transpose()?;
+    Ok(Some(Evaluated { report, picture }))
 }
 
 fn describe_file(path: Option<&Path>) -> String {

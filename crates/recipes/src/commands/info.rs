@@ -11,9 +11,10 @@ use vae::{BevVae, BevVaeConfig, Discriminator, Preset};
 
 use super::common::say;
 use crate::bev_vae::Experiment;
+use crate::rigs::RigChoice;
 use crate::{ModelChoice, config_file};
 
-/// Print the sizes of a preset, of an experiment's model, what a checkpoint holds, or which weight files are known
+/// Print the sizes of a preset, of an experiment's model, what a checkpoint holds, a rig, or which weight files are known
 #[derive(Debug, Parser)]
 pub struct InfoArgs {
     /// Preset: debug, tiny, small or paper
@@ -25,6 +26,9 @@ pub struct InfoArgs {
     /// Run folder or checkpoint folder
     #[arg(long, value_name = "DIR")]
     pub checkpoint: Option<PathBuf>,
+    /// Other cameras; the help text names the choices.
+    #[arg(long, value_name = "RIG", help = "Print a rig as JSON, to start a rig file from: a built-in one's name, or what --rig of other commands takes", conflicts_with_all = ["preset", "config", "checkpoint", "weights"])]
+    pub rig: Option<RigChoice>,
     /// List the weight files that metrics and losses know: where they come from, licence, stand-ins
     #[arg(long, conflicts_with_all = ["preset", "config", "checkpoint"])]
     pub weights: bool,
@@ -40,6 +44,9 @@ fn parse_preset(text: &str) -> Result<Preset, String> {
 /// # Errors
 /// Unreadable files.
 pub fn info(args: &InfoArgs) -> anyhow::Result<()> {
+    if let Some(choice) = &args.rig {
+        return say(serde_json::to_string_pretty(&choice.open()?)?);
+    }
     if args.weights {
         return KNOWN_WEIGHTS.iter().try_for_each(list_weights);
     }

@@ -12,7 +12,7 @@ use data::{
 use geometry::{CameraRig, ImageEdit, RigPreset};
 
 use super::common::say;
-use super::novel_view::parse_rig;
+use crate::rigs::{RIG_HELP, RigChoice};
 
 /// Frames of the layouts without key frames follow each other in this time.
 const STEP_SECS: f64 = 0.1;
@@ -70,9 +70,9 @@ pub struct MakeDataArgs {
     /// Seed of everything
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
-    /// Cameras: nuscenes, argoverse2, waymo, ... (pinhole rigs only; nuscenes only) [default: the layout's own]
-    #[arg(long, value_name = "RIG", value_parser = parse_rig)]
-    pub rig: Option<RigPreset>,
+    /// Other cameras; the help text names the choices.
+    #[arg(long, value_name = "RIG", help = format!("{RIG_HELP}; pinhole rigs only, --format nuscenes only [default: the layout's own]"))]
+    pub rig: Option<RigChoice>,
     /// Size of all pictures, for example 800x450 (nuscenes) [default: each camera's own]
     #[arg(long, value_name = "WxH", value_parser = parse_size, conflicts_with = "scale")]
     pub size: Option<(u32, u32)>,
@@ -157,15 +157,16 @@ fn make_nuscenes(args: &MakeDataArgs, progress: &mut dyn FnMut(usize, usize)) ->
         sweeps: args.sweeps,
         image_size: args.size,
         jpeg_quality: args.quality,
-        ..NuScenesWriterConfig::new(args.out.clone(), rig(args))
+        ..NuScenesWriterConfig::new(args.out.clone(), rig(args)?)
     };
     let manifest = write_nuscenes(&config, progress)?;
     let names: Vec<&str> = manifest.scenes.iter().map(|scene| scene.name.as_str()).collect();
     say(format_args!("{} written to {} (pictures: {})", names.join(", "), args.out.display(), manifest.pictures))
 }
 
-fn rig(args: &MakeDataArgs) -> CameraRig {
-    let mut rig = args.rig.unwrap_or(args.format.rig()).rig();
+fn rig(args: &MakeDataArgs) -> anyhow::Result<CameraRig> {
+    let choice = args.rig.clone().unwrap_or(RigChoice::BuiltIn(args.format.rig()));
+    let mut rig = choice.open()?;
     if let Some(scale) = args.scale {
         for camera in &mut rig.cameras {
             let raw = camera.intrinsics;
@@ -174,7 +175,7 @@ fn rig(args: &MakeDataArgs) -> CameraRig {
             camera.intrinsics = edit.intrinsics(&raw);
         }
     }
-    rig
+    Ok(rig)
 }
 
 fn world_of(args: &MakeDataArgs) -> anyhow::Result<Procedural> {
@@ -182,7 +183,7 @@ fn world_of(args: &MakeDataArgs) -> anyhow::Result<Procedural> {
         seed: args.seed,
         scenes: args.scenes,
         frames_per_scene: args.key_frames,
-        rig: RigSource::Cameras(rig(args)),
+        rig: RigSource::Cameras(rig(args)?),
         ..ProceduralConfig::default()
     };
     config.world.duration_secs = STEP_SECS * args.key_frames as f64;

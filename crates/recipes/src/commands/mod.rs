@@ -1,14 +1,17 @@
 //! What the binaries do, one file per subcommand.
 
+mod change_rig;
 mod check_data;
 mod check_table;
 mod common;
 mod data_source;
 mod encode;
 mod evaluate;
+mod import;
 mod info;
 mod make_data;
 mod novel_view;
+mod pictures;
 mod reconstruct;
 mod sample;
 mod show_data;
@@ -17,15 +20,19 @@ mod train_dit;
 mod train_unet;
 mod train_vae;
 mod training;
+mod views;
 
+pub use change_rig::{ChangeRigArgs, change_rig};
 pub use check_data::{CheckDataArgs, check_data};
 pub use common::{DataArgs, LoadedModel, UsageError, run_main};
 pub use data_source::{Chosen, DataSource, Named};
 pub use encode::{EncodeArgs, encode};
 pub use evaluate::{EvaluateArgs, evaluate};
+pub use import::{ImportArgs, ImportBevVaeArgs, ImportModel, Weights, import};
 pub use info::{InfoArgs, info};
 pub use make_data::{MakeDataArgs, make_data};
 pub use novel_view::{NovelViewArgs, novel_view};
+pub use pictures::{PictureArgs, PictureFormat};
 pub use reconstruct::{ReconstructArgs, reconstruct};
 pub use sample::{SampleArgs, sample};
 pub use show_data::{ShowDataArgs, show_data};
@@ -34,3 +41,4 @@ pub use train_dit::{TrainDitArgs, train_dit};
 pub use train_unet::{TrainUNetArgs, train_unet};
 pub use train_vae::{TrainVaeArgs, train_vae};
 pub use training::TrainArgs;
+pub use views::MotionArgs;

@@ -1,27 +1,39 @@
 //! `train-vae`: trains BEV-VAE as its config says, measures it and writes everything into the run's folder.
 
-use anyhow::Context;
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
 use clap::Parser;
 use serde::Serialize;
-use train::Outcome;
+use train::{DeviceConfig, Outcome, find_checkpoint};
 
 use super::common::say;
 use super::training::{
     LoopFigures, Prepared, TrainArgs, loop_line, prepare, print_config, train_experiment, write_summary,
 };
-use crate::bev_vae::{BevVaeTask, Evaluation, Evaluator, Experiment, MeanPictures, Scores};
+use crate::bev_vae::{
+    BevVaeTask, Budget, Evaluation, Evaluator, Experiment, MeanPictures, Scores, Walk, duration, free_memory,
+    operations_per_second, refusal,
+};
 
 /// Train BEV-VAE: pictures of any camera rig to one bird's-eye-view latent and back
 #[derive(Debug, Parser)]
 #[command(
     name = "train-vae",
     version,
-    after_help = "Example:\n  train-vae --config configs/toy/vae.toml --set train.steps=200"
+    after_help = "Examples:\n  train-vae --config configs/toy/vae.toml --set train.steps=200\n  train-vae --config my_car.toml --init-from runs/toy-vae"
 )]
 pub struct TrainVaeArgs {
     /// What every training command takes.
     #[command(flatten)]
     pub run: TrainArgs,
+    /// Start from the averaged weights of this run or checkpoint folder (of train-vae or of `rigscape import`), with fresh optimizers:
+    /// fine-tuning, for example on a new rig. The networks must be equal
+    #[arg(long, value_name = "DIR")]
+    pub init_from: Option<PathBuf>,
+    /// Start even if the run looks too large for this machine's memory
+    #[arg(long)]
+    pub ignore_memory: bool,
 }
 
 train_experiment!(Experiment);
@@ -41,16 +53,51 @@ struct Summary {
 /// # Errors
 /// Anything that keeps the run from its end; checkpoints written so far stay usable.
 pub fn train_vae(args: &TrainVaeArgs) -> anyhow::Result<()> {
-    if args.run.print_config {
-        return print_config::<Experiment>(&args.run);
+    let mut options = args.run.clone();
+    if let Some(path) = &args.init_from {
+        // Through the config, so that the run's folder says where its weights come from.
+        let path = toml::Value::String(path.to_string_lossy().into_owned());
+        options.overrides.push(format!("init_from={path}"));
     }
-    let mut run: Prepared<Experiment> = prepare(&args.run)?;
-    let mut task = BevVaeTask::new(&run.experiment, &run.device.clone().autodiff(), evaluator(&run)?)?;
+    if options.print_config {
+        return print_config::<Experiment>(&options);
+    }
+    let mut run: Prepared<Experiment> = prepare(&options)?;
+    weigh(&run, args.ignore_memory)?;
+    // A run that goes on has weights of its own.
+    let goes_on = args.run.resume && find_checkpoint(run.run_dir.path()).is_ok();
+    let init_from = run.experiment.init_from.as_deref().filter(|_| !goes_on);
+    let mut task = BevVaeTask::new(&run.experiment, &run.device.clone().autodiff(), evaluator(&run)?, init_from)?;
     let outcome = run.train(&mut task, &args.run)?;
     if outcome.interrupted {
         return Ok(());
     }
     finish(&mut run, &task, &outcome)
+}
+
+/// Says what the run will take, and refuses one that cannot fit.
+fn weigh(run: &Prepared<Experiment>, anyway: bool) -> anyhow::Result<()> {
+    let experiment = &run.experiment;
+    let mut views = 0;
+    for dataset in run.training.iter().filter(|dataset| !dataset.is_empty()) {
+        views = views.max(dataset.frame(0)?.views.len());
+    }
+    let walk = Walk::of(experiment, views);
+    let budget = Budget::of(experiment, walk);
+    let time = duration(budget.operations, operations_per_second(&run.device));
+    // Another device's memory is not ours to look into.
+    let on_host = matches!(experiment.device, DeviceConfig::Flex | DeviceConfig::NdArray);
+    let free = if on_host { free_memory() } else { None };
+    let space = free.map_or_else(String::new, |free| format!("; {:.1} GB are free", free / 1e9));
+    tracing::info!("estimate: {budget}{space}; {time} for {} steps if nothing else runs here", walk.steps);
+    match free.and_then(|free| refusal(experiment, walk, free)) {
+        Some(why) if !anyway => bail!(why),
+        Some(why) => {
+            tracing::warn!("{why}");
+            Ok(())
+        }
+        None => Ok(()),
+    }
 }
 
 fn evaluator(run: &Prepared<Experiment>) -> anyhow::Result<Evaluator> {

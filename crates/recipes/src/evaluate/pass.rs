@@ -134,7 +134,7 @@ impl Pass {
                 for (index, values, [real, generated]) in work {
                     for (at, channel, value) in values {
                         if let Some(scalar) = self.scalars.get_mut(at) {
-                            scalar.add(value, &format!("{index}:{channel}"));
+                            scalar.add(value, index, &channel);
                         }
                     }
                     self.count(&generated);

@@ -5,8 +5,8 @@ mod markdown;
 use std::collections::BTreeMap;
 
 use metrics::{
-    FeatureStatistics, FrechetDistance, KidSubsets, MetricChoice, Protocol, frechet_distance, kid, mvsc,
-    precision_recall,
+    FeatureStatistics, FrechetDistance, KidSubsets, MetricChoice, NovelViewSummary, Protocol, frechet_distance, kid,
+    mvsc, precision_recall,
 };
 use serde::Serialize;
 
@@ -29,6 +29,9 @@ pub struct MetricReport {
     pub value: Option<f64>,
     /// Deviation over pictures or subsets.
     pub deviation: Option<f64>,
+    /// The value of each camera, where pairs are compared and cameras have names.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub cameras: BTreeMap<String, Option<f64>>,
     /// Unit of the value.
     pub unit: &'static str,
     /// Which direction is good.
@@ -76,6 +79,9 @@ pub struct Report {
     pub wall_seconds: f64,
     /// One entry per number.
     pub metrics: Vec<MetricReport>,
+    /// Views that no camera took against their rendering, one entry per motion of the rig (protocol `nvs/toy`).
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub novel_views: Vec<NovelViewSummary>,
 }
 
 /// Statistics per stream and side, where a file replaces a side.
@@ -105,6 +111,8 @@ pub fn numbers(
                         report = report.looked_through(&loaded.weights, loaded.stand_in.as_ref());
                     }
                     (report.value, report.deviation) = (scalar.mean.mean(), scalar.mean.deviation());
+                    let named = scalar.cameras.iter().filter(|(camera, _)| !camera.is_empty());
+                    report.cameras = named.map(|(camera, mean)| (camera.clone(), mean.mean())).collect();
                     if scalar.identical > 0 {
                         let identical = scalar.identical;
                         report
@@ -144,6 +152,7 @@ fn start(protocol: &Protocol, samples: u64) -> MetricReport {
         protocol: protocol.name.clone(),
         value: None,
         deviation: None,
+        cameras: BTreeMap::new(),
         unit,
         higher_is_better,
         samples,

@@ -1,5 +1,7 @@
 //! Metrics with one number per pair of pictures.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context, bail};
 use metrics::{
     Histogram, ImageSize, Mean, MetricChoice, PictureStep, Protocol, Raster, Worst, image_mse, ms_ssim, psnr_db, ssim,
@@ -20,6 +22,8 @@ pub struct ScalarMetric {
     pub network: Option<Loaded<dyn PairNetwork>>,
     /// Over pictures; those equal to their counterpart are left out of PSNR.
     pub mean: Mean,
+    /// The same for each camera; a single unnamed one for folders.
+    pub cameras: BTreeMap<String, Mean>,
     /// Equal pairs of PSNR.
     pub identical: u64,
     /// How the values spread.
@@ -43,6 +47,7 @@ impl ScalarMetric {
             protocol: protocol.clone(),
             network,
             mean: Mean::default(),
+            cameras: BTreeMap::new(),
             identical: 0,
             histogram: Histogram::new(range.0, range.1, BINS),
             worst: Worst::new(keep_worst, higher_is_better),
@@ -63,15 +68,16 @@ impl ScalarMetric {
         loaded.network.distance(pictures(&real), pictures(&generated))
     }
 
-    /// Takes the value of a pair in.
-    pub fn add(&mut self, value: f64, place: &str) {
+    /// Takes the value of a pair in: that of an instant's camera.
+    pub fn add(&mut self, value: f64, index: usize, channel: &str) {
         if value == f64::INFINITY {
             self.identical += 1;
             return;
         }
         self.mean.add(value);
+        self.cameras.entry(channel.to_owned()).or_default().add(value);
         self.histogram.add(value);
-        self.worst.add(value, place);
+        self.worst.add(value, &format!("{index}:{channel}"));
     }
 }
 

@@ -20,13 +20,13 @@ fn device() -> Device {
 }
 
 /// Weights as after some training: fresh networks start with layers of zeros, under which much would hold by accident.
-fn model(config: &BevVaeConfig, device: &Device) -> BevVae {
+pub fn model(config: &BevVaeConfig, device: &Device) -> BevVae {
     let fresh = BevVae::new(config, &mut Init::new(7, device));
     fill_params(fresh, |path, shape| Ok(golden_values(path, shape))).unwrap()
 }
 
 /// The first `count` cameras of a real rig.
-fn rig(preset: RigPreset, count: usize) -> CameraRig {
+pub fn rig(preset: RigPreset, count: usize) -> CameraRig {
     let mut rig = preset.rig();
     rig.cameras.truncate(count);
     rig
@@ -56,7 +56,7 @@ fn product(k: DMat3, pose: &Rigid, lift: bool) -> (DMat3, DVec3) {
     if lift { (rotation * k.inverse(), pose.translation) } else { (k * rotation, k * pose.translation) }
 }
 
-fn matrices(rigs: &[&CameraRig], config: &BevVaeConfig, views: usize, lift: bool, device: &Device) -> ViewMatrices {
+pub fn matrices(rigs: &[&CameraRig], config: &BevVaeConfig, views: usize, lift: bool, device: &Device) -> ViewMatrices {
     let values: Vec<f32> = rigs.iter().flat_map(|rig| rows(rig, config, views, lift)).collect();
     let mask: Vec<bool> = rigs.iter().flat_map(|rig| (0..views).map(|v| v < rig.len())).collect();
     ViewMatrices {
@@ -65,7 +65,7 @@ fn matrices(rigs: &[&CameraRig], config: &BevVaeConfig, views: usize, lift: bool
     }
 }
 
-fn noise<const D: usize>(name: &str, shape: [usize; D], device: &Device) -> Tensor<D> {
+pub fn noise<const D: usize>(name: &str, shape: [usize; D], device: &Device) -> Tensor<D> {
     let values: Vec<f32> = golden_stream(name, shape.iter().product()).into_iter().map(|v| v as f32).collect();
     Tensor::from_data(TensorData::new(values, shape), device)
 }

@@ -2,4 +2,6 @@
 
 mod behaviour;
 mod golden;
+mod lightning;
 mod official;
+mod segmented;

@@ -1,6 +1,7 @@
 //! Files of `torch.save`: a zip archive with one pickle and one entry per storage, or (before torch 1.6) a sequence of pickles
 //! followed by the storages. The pickle is decoded as data; see the `pickle` crate.
 
+mod groups;
 mod legacy;
 mod state_dict;
 mod zip_archive;
@@ -11,6 +12,8 @@ use std::io::{Read, Seek};
 use std::path::Path;
 
 use pickle::{Graph, Limits};
+
+pub use groups::TensorGroup;
 
 use super::file::Contents;
 use super::{TorchFault, WeightError};
@@ -57,6 +60,30 @@ pub(super) fn read(
     keys: Option<&[&str]>,
     path: &Path,
 ) -> Result<Contents, WeightError> {
+    look_into(file, container, path, |graph, storages| contents(graph, storages, keys))
+}
+
+/// Every dictionary and list that holds tensors, in the order of the file.
+///
+/// # Errors
+/// [`WeightError::Io`], [`WeightError::Torch`] for a damaged file, [`WeightError::Layout`] for one that torch did not write.
+pub fn torch_groups(path: impl AsRef<Path>) -> Result<Vec<TensorGroup>, WeightError> {
+    let path = path.as_ref();
+    let io = |source| WeightError::Io { source, path: path.to_path_buf() };
+    let mut file = File::open(path).map_err(io)?;
+    let Some(container) = container(&mut file).map_err(io)? else {
+        let reason = "not a file of torch.save".to_owned();
+        return Err(WeightError::Layout { reason, path: path.to_path_buf() });
+    };
+    look_into(&mut file, container, path, |graph, _| Ok(groups::groups(graph.root())))
+}
+
+fn look_into<T>(
+    file: &mut File,
+    container: Container,
+    path: &Path,
+    look: impl FnOnce(&Graph<'_>, &Storages) -> Result<T, TorchFault>,
+) -> Result<T, WeightError> {
     let wrap = |source| WeightError::Torch { source, path: path.to_path_buf() };
     let io = |source| WeightError::Io { source, path: path.to_path_buf() };
     let file_bytes = file.metadata().map_err(io)?.len();
@@ -67,14 +94,14 @@ pub(super) fn read(
             if taken != pickle.len() {
                 return Err(wrap(TorchFault::Container("data.pkl goes on after its end marker".to_owned())));
             }
-            contents(&graph, &storages, keys).map_err(wrap)
+            look(&graph, &storages).map_err(wrap)
         }
         Container::Legacy => {
             let mut head = Vec::new();
             file.take(LIMITS.max_bytes as u64).read_to_end(&mut head).map_err(io)?;
             let parsed = legacy::parse(&head).map_err(wrap)?;
             let storages = legacy::storages(file, file_bytes, &parsed).map_err(wrap)?;
-            contents(&parsed.graph, &storages, keys).map_err(wrap)
+            look(&parsed.graph, &storages).map_err(wrap)
         }
     }
 }

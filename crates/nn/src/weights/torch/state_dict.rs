@@ -21,9 +21,10 @@ pub(super) fn find<'g>(root: Object<'g>, keys: Option<&[&str]>) -> Result<Object
     }
     if let Some(keys) = keys {
         let path = keys.join("/");
-        let inner = keys.iter().try_fold(root, |object, key| object.get(key));
-        let inner = inner.filter(|object| object.entries().is_some());
-        return inner.ok_or_else(|| missing(format!("no dictionary under {path}; there are {}", key_list(root))));
+        let inner = keys.iter().try_fold(root, |object, key| member(object, key));
+        let inner = inner.filter(|object| members(*object).is_some());
+        return inner
+            .ok_or_else(|| missing(format!("no dictionary or list under {path}; there are {}", key_list(root))));
     }
     if holds_tensors(root) {
         return Ok(root);
@@ -41,11 +42,35 @@ pub(super) fn find<'g>(root: Object<'g>, keys: Option<&[&str]>) -> Result<Object
     }
 }
 
+/// What a dictionary holds under text keys, numbers and classes (by name), and a list under its positions.
+pub(super) fn members(object: Object<'_>) -> Option<Vec<(String, Object<'_>)>> {
+    let Some(entries) = object.entries() else {
+        let items = object.items()?.into_iter().enumerate();
+        return Some(items.map(|(position, item)| (position.to_string(), item)).collect());
+    };
+    let label = |key: Object<'_>| match (key.text(), key.integer(), key.global()) {
+        (Some(text), ..) => Some(text.to_owned()),
+        (_, Some(number), _) => Some(number.to_string()),
+        (.., Some((module, name))) => Some(format!("{module}.{name}")),
+        _ => None,
+    };
+    Some(entries.into_iter().filter_map(|(key, value)| Some((label(key)?, value))).collect())
+}
+
+fn member<'g>(object: Object<'g>, key: &str) -> Option<Object<'g>> {
+    // Python keeps the last of equal keys.
+    members(object)?.into_iter().rev().find(|(label, _)| label == key).map(|(_, value)| value)
+}
+
 /// The text keys of a dictionary, the first ten of them.
 fn key_list(dictionary: Object<'_>) -> String {
     let entries = dictionary.entries().unwrap_or_default();
     let keys: Vec<&str> = entries.iter().filter_map(|(key, _)| key.text()).take(10).collect();
     if keys.is_empty() { "no names".to_owned() } else { keys.join(", ") }
+}
+
+pub(super) fn is_tensor(object: Object<'_>) -> bool {
+    Rebuild::of(object).is_some()
 }
 
 fn holds_tensors(object: Object<'_>) -> bool {
@@ -56,11 +81,10 @@ fn holds_tensors(object: Object<'_>) -> bool {
 pub(super) fn tensors(state_dict: Object<'_>, storages: &Storages) -> Result<Contents, TorchFault> {
     let mut contents = Contents::default();
     let mut budget = storages.values().map(|storage| storage.bytes).sum::<u64>().saturating_mul(MAX_SHARING);
-    for (key, value) in state_dict.entries().unwrap_or_default() {
-        let Some(name) = key.text() else { continue };
-        let fault = |reason: String| TorchFault::Tensor { name: name.to_owned(), reason };
+    for (name, value) in members(state_dict).unwrap_or_default() {
+        let fault = |reason: String| TorchFault::Tensor { name: name.clone(), reason };
         let Some(rebuild) = Rebuild::of(value) else {
-            contents.others.push(name.to_owned());
+            contents.others.push(name);
             continue;
         };
         let entry = rebuild.entry(storages).map_err(fault)?;
@@ -68,9 +92,11 @@ pub(super) fn tensors(state_dict: Object<'_>, storages: &Storages) -> Result<Con
         budget = budget.checked_sub(bytes).ok_or_else(|| {
             fault(format!("with it the tensors name more than {MAX_SHARING} times the bytes of the file"))
         })?;
-        if contents.tensors.insert(name.to_owned(), entry).is_some() {
+        if contents.tensors.contains_key(&name) {
             return Err(fault("the name is given twice".to_owned()));
         }
+        contents.order.push(name.clone());
+        contents.tensors.insert(name, entry);
     }
     Ok(contents)
 }

@@ -6,11 +6,12 @@ use std::sync::Arc;
 
 use anyhow::bail;
 use data::{DatasetConfig, SceneDataset};
+use metrics::{ImageSize, NovelViewSummary, NovelViews};
 use serde::Deserialize;
 
 use super::super::common::{LoadedModel, UsageError};
 use super::EvaluateArgs;
-use crate::bev_vae::Viewer;
+use crate::bev_vae::{Viewer, pictures_of, renders};
 use crate::config_file;
 use crate::evaluate::{DatasetPictures, Folder, Painted, PictureSource};
 
@@ -57,6 +58,36 @@ pub(super) fn painted<'a>(loaded: &'a LoadedModel, dataset: &Arc<dyn SceneDatase
     let size = loaded.experiment.image_size();
     let side = |decoded| Box::new(Painted::new(viewer(), Arc::clone(dataset), frames.clone(), size, decoded));
     (Some(side(false)), side(true))
+}
+
+/// Decodes the rig turned and compares with its rendering; nothing where the data cannot render it.
+pub(super) fn novel_views(
+    loaded: &LoadedModel,
+    dataset: &Arc<dyn SceneDataset>,
+    yaw_deg: &[f64],
+    frames: usize,
+) -> anyhow::Result<Vec<NovelViewSummary>> {
+    let viewer = Viewer::new(&loaded.experiment, &loaded.model, &loaded.device);
+    let size = loaded.experiment.image_size();
+    let size = ImageSize { channels: 3, height: size.height as usize, width: size.width as usize };
+    let usual = &loaded.experiment.evaluation.yaw_deg;
+    let turns = if yaw_deg.is_empty() { usual.as_slice() } else { yaw_deg };
+    let most = if frames == 0 { usize::MAX } else { frames };
+    let mut scores = NovelViews::default();
+    for index in dataset.scene_ranges().into_iter().flat_map(|range| range.take(most)) {
+        let frame = dataset.frame(index)?;
+        if !renders(&frame) {
+            break;
+        }
+        let coded = viewer.encode(&frame)?;
+        for yaw in turns {
+            let Some(truth) = viewer.truth(&frame, &frame.rig().rotated(yaw.to_radians()))? else { continue };
+            for (picture, truth) in viewer.decode(&coded, &truth).iter().zip(pictures_of(&truth)) {
+                scores.update(&format!("yaw {yaw:+} deg"), picture, truth, size);
+            }
+        }
+    }
+    Ok(scores.summaries())
 }
 
 pub(super) fn model(path: &Path) -> BTreeMap<String, String> {

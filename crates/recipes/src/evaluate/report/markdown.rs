@@ -43,6 +43,8 @@ impl Report {
                 one.name, one.samples, one.protocol
             ));
         }
+        text.push_str(&self.novel_view_table());
+        text.push_str(&self.camera_table());
         let mut notes = String::new();
         for one in &self.metrics {
             for note in &one.notes {
@@ -55,6 +57,38 @@ impl Report {
             text.push_str(&notes);
         }
         text
+    }
+}
+
+impl Report {
+    fn novel_view_table(&self) -> String {
+        if self.novel_views.is_empty() {
+            return String::new();
+        }
+        let head = "\n## Views that no camera took, against their rendering (nvs/toy)\n\n| rig | PSNR | SSIM | pictures |\n|---|---|---|---|\n";
+        self.novel_views.iter().fold(head.to_owned(), |text, one| {
+            let number = |value: Option<f64>| value.map_or("-".to_owned(), rounded);
+            let (db, ssim) = (number(one.psnr.mean_db), number(one.ssim));
+            text + &format!("| {} | {db} dB | {ssim} | {} |\n", one.motion, one.psnr.images)
+        })
+    }
+
+    /// A row per camera, a column per metric of pairs.
+    fn camera_table(&self) -> String {
+        let columns: Vec<_> = self.metrics.iter().filter(|one| !one.cameras.is_empty()).collect();
+        let cameras: std::collections::BTreeSet<&String> = columns.iter().flat_map(|one| one.cameras.keys()).collect();
+        if cameras.is_empty() {
+            return String::new();
+        }
+        let titles: Vec<String> = columns.iter().map(|one| format!("{} ({})", one.name, one.protocol)).collect();
+        let head =
+            format!("\n## Per camera\n\n| camera | {} |\n|---|{}\n", titles.join(" | "), "---|".repeat(titles.len()));
+        cameras.into_iter().fold(head, |text, camera| {
+            let value =
+                |one: &&super::MetricReport| one.cameras.get(camera).copied().flatten().map_or("-".to_owned(), rounded);
+            let values: Vec<String> = columns.iter().map(value).collect();
+            text + &format!("| {camera} | {} |\n", values.join(" | "))
+        })
     }
 }
 

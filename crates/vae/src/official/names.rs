@@ -71,3 +71,25 @@ fn head_positions(name: String) -> String {
     }
     name
 }
+
+/// The official shape of one of our parameters: convolutions over single pixels or voxels are matrices here.
+pub fn official_shape(path: &str, ours: &[usize]) -> Vec<usize> {
+    let pointwise_axes = match path {
+        "encoder.state.squeeze.weight" | "decoder.state.expand.weight" => 3,
+        _ if path.starts_with("encoder.scene.pyramid.") && path.ends_with(".pointwise.weight") => 2,
+        _ if path.starts_with("decoder.scene.pyramid.") && path.ends_with(".pointwise.weight") => 3,
+        _ => 0,
+    };
+    [ours, &[1, 1, 1][..pointwise_axes]].concat()
+}
+
+/// Whether an official name belongs to none of our parameters by design: tables that follow from the config, colours of diagrams,
+/// networks of losses and metrics.
+pub fn is_ignored(name: &str) -> bool {
+    const PREFIXES: [&str; 3] = ["evaluation.", "matcher.", "loss."];
+    const COLOURS: [&str; 4] = ["img_color", "scn_color", "stt_color", "cond_color"];
+    const TABLES: [&str; 3] = [".scene_3d", ".frustum_3d", ".pos_embedding.inv_freq"];
+    PREFIXES.iter().any(|prefix| name.starts_with(prefix))
+        || COLOURS.contains(&name)
+        || TABLES.iter().any(|table| name.ends_with(table))
+}
