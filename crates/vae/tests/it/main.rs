@@ -4,4 +4,5 @@ mod behaviour;
 mod golden;
 mod lightning;
 mod official;
+mod released;
 mod segmented;

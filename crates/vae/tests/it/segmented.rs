@@ -44,7 +44,10 @@ fn segments_give_the_gradients_of_one_tape() {
         ("last tokens", pass.last_tokens().inner_values(), decoded.last_tokens.inner_values()),
         ("KL", pass.posterior().kl().inner_values(), posterior.kl().inner_values()),
     ] {
-        assert_eq!(got, wanted, "{name}");
+        // Kernels with and without a tape order their sums differently.
+        let off = got.iter().zip(&wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let size = wanted.iter().map(|v| v.abs()).fold(0.0, f64::max);
+        assert!(got.len() == wanted.len() && off <= 1e-5 * size, "{name}: off by {off:e} of {size:e}");
     }
     let got = named_gradients(&model, &pass.backward(&model, upstream, kl_weight));
     assert_eq!(got.len(), want.len());
