@@ -9,3 +9,4 @@ mod latent_runs;
 mod programs;
 mod runs;
 mod sensitivity;
+mod synthesis;

@@ -10,6 +10,7 @@ mod clip;
 pub mod colmap;
 mod embedded;
 mod error;
+pub mod export;
 mod frame;
 mod image_source;
 mod jpeg;

@@ -16,6 +16,7 @@ mod model_choice;
 mod reconstruction;
 pub mod sheet;
 pub mod show;
+pub mod synthesis;
 pub mod tensors;
 mod trainer;
 

@@ -9,6 +9,7 @@ mod annotations;
 mod arcline;
 mod atlas;
 mod config;
+mod frames;
 mod lidar;
 mod map_expansion;
 mod map_rows;
@@ -26,6 +27,7 @@ use std::path::Path;
 use world::{World, WorldConfig};
 
 pub(crate) use config::scaled;
+pub(crate) use frames::write_nuscenes_frames;
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
 
 use crate::DataError;

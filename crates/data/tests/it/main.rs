@@ -3,6 +3,7 @@
 mod archives;
 mod argoverse2;
 mod clips;
+mod export;
 mod colmap;
 mod fuzzed;
 mod generated;

@@ -4,8 +4,10 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    CheckDataArgs, EncodeArgs, EvaluateArgs, InfoArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs, SampleArgs,
-    ShowDataArgs, check_data, encode, evaluate, info, make_data, novel_view, reconstruct, run_main, sample, show_data,
+    CheckDataArgs, EncodeArgs, EvaluateArgs, InfoArgs, LayoutCommandArgs, MakeDataArgs, NovelViewArgs, ReconstructArgs,
+    ReplaceHistoryArgs, SampleArgs, ShowDataArgs, SweepGuidanceArgs, SynthesizeArgs, check_data, encode, evaluate,
+    info, layout, make_data, novel_view, reconstruct, replace_history, run_main, sample, show_data, sweep_guidance,
+    synthesize,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -21,12 +23,16 @@ enum Command {
     MakeData(MakeDataArgs),
     CheckData(CheckDataArgs),
     ShowData(ShowDataArgs),
+    Layout(LayoutCommandArgs),
+    ReplaceHistory(ReplaceHistoryArgs),
     Encode(Box<EncodeArgs>),
     Evaluate(Box<EvaluateArgs>),
     Info(InfoArgs),
     Reconstruct(ReconstructArgs),
     NovelView(NovelViewArgs),
     Sample(SampleArgs),
+    Synthesize(Box<SynthesizeArgs>),
+    SweepGuidance(SweepGuidanceArgs),
 }
 
 fn main() -> ExitCode {
@@ -35,11 +41,15 @@ fn main() -> ExitCode {
         Command::MakeData(args) => make_data(args),
         Command::CheckData(args) => check_data(args),
         Command::ShowData(args) => show_data(args),
+        Command::Layout(args) => layout(args),
+        Command::ReplaceHistory(args) => replace_history(args),
         Command::Encode(args) => encode(args),
         Command::Evaluate(args) => evaluate(args),
         Command::Info(args) => info(args),
         Command::Reconstruct(args) => reconstruct(args),
         Command::NovelView(args) => novel_view(args),
         Command::Sample(args) => sample(args),
+        Command::Synthesize(args) => synthesize(args),
+        Command::SweepGuidance(args) => sweep_guidance(args),
     })
 }
