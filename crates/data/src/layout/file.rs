@@ -144,10 +144,21 @@ impl LayoutFile {
     /// # Errors
     /// [`DataError::Io`], naming the file.
     pub fn write(&self, path: &Path) -> Result<(), DataError> {
-        let json = |error: serde_json::Error| DataError::Json { why: error.to_string(), path: path.to_owned() };
-        let mut bytes = serde_json::to_vec_pretty(self).map_err(json)?;
-        bytes.push(b'\n');
-        staging::write_renamed(path, &bytes)
+        let text = self.text().map_err(|error| DataError::Json { why: error.to_string(), path: path.to_owned() })?;
+        staging::write_renamed(path, text.as_bytes())
+    }
+
+    /// One box per line, for people who edit files.
+    fn text(&self) -> Result<String, serde_json::Error> {
+        let mut parts = Vec::new();
+        if let Some(source) = &self.source {
+            parts.push(format!("  \"source\": {}", serde_json::to_string(source)?));
+        }
+        parts.push(format!("  \"boxes\": {}", lines(&self.boxes)?));
+        if !self.edits.is_empty() {
+            parts.push(format!("  \"edits\": {}", lines(&self.edits)?));
+        }
+        Ok(format!("{{\n{}\n}}\n", parts.join(",\n")))
     }
 
     /// The layout with its edits made.
@@ -165,13 +176,18 @@ impl LayoutFile {
     }
 }
 
+fn lines<T: Serialize>(items: &[T]) -> Result<String, serde_json::Error> {
+    let items: Vec<String> = items.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+    Ok(if items.is_empty() { "[]".to_owned() } else { format!("[\n    {}\n  ]", items.join(",\n    ")) })
+}
+
 impl Layout {
     /// Reads a file and makes its edits.
     ///
     /// # Errors
     /// As [`LayoutFile::read`]; [`DataError::Layout`] for what [`LayoutFile::layout`] refuses.
     pub fn read(path: &Path, classes: &LayoutClasses) -> Result<Self, DataError> {
-        let wrap = |source| DataError::Layout { source, path: path.to_owned() };
+        let wrap = |why| DataError::Layout { why, path: path.to_owned() };
         LayoutFile::read(path)?.layout(classes).map_err(wrap)
     }
 
@@ -233,6 +249,12 @@ mod tests {
         assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1, "no half file stays");
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.contains("\"rotation\"") && text.contains("\"yaw\"") && !text.contains("source"), "{text}");
+        assert_eq!(text.lines().count(), 6, "a line per box: {text}");
+        let source = LayoutSource { dataset: "d".into(), scene: "s".into(), frame: "f".into() };
+        let edits = vec!["remove:a".parse().unwrap(), "remove:b".parse().unwrap()];
+        let whole = LayoutFile { edits, ..LayoutFile::of(&Layout::default(), Some(source)) };
+        whole.write(&path).unwrap();
+        assert_eq!(LayoutFile::read(&path).unwrap(), whole);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use data::argoverse2::{Argoverse2, Argoverse2Config, Split};
+use data::argoverse2::{Argoverse2, Argoverse2Config};
 use data::export::{
     ExportConfig, ExportFormat, ExportManifest, Exported, Generator, HistoryConfig, LinkKind, conditioned, export,
     replace_history,
@@ -193,7 +193,7 @@ fn frames_of_any_dataset_become_argoverse2_logs() {
     let source = world(RigPreset::Argoverse2, "streets");
     let out = dir.path().join("made");
     whole(&source, &ExportConfig::new(&out, ExportFormat::Argoverse2, generator()));
-    let made = Argoverse2::open(&Argoverse2Config::new(&out, Split::Train)).unwrap();
+    let made = Argoverse2::open(&Argoverse2Config::new(&out)).unwrap();
     assert_eq!(made.len(), source.len());
     let mut seen = 0;
     for back in (0..made.len()).map(|index| made.frame(index).unwrap()) {

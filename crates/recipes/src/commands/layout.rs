@@ -82,7 +82,7 @@ impl LayoutArgs {
                 let file = LayoutFile::read(path)?;
                 let source = file.source.clone();
                 let layout = file.layout(classes);
-                let layout = layout.map_err(|source| data::DataError::Layout { source, path: path.clone() })?;
+                let layout = layout.map_err(|why| data::DataError::Layout { why, path: path.clone() })?;
                 ChosenLayout { original: layout.clone(), layout, page: None, source }
             }
             None => {

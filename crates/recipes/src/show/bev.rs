@@ -25,7 +25,7 @@ struct Panel {
 }
 
 /// The first letters of a name that are drawn; tokens are no reading matter.
-const NAME_LETTERS: usize = 12;
+const NAME_LETTERS: usize = 18;
 
 /// The drawn square of this side.
 pub(super) fn draw(content: &PageContent, options: &PageOptions, side: u32, scale: u32) -> Canvas {
@@ -151,8 +151,9 @@ impl Panel {
 
     fn name(&mut self, object: &ObjectBox) {
         let name: String = object.track.chars().take(NAME_LETTERS).collect();
-        let at = self.pixel(object.box3d.center.xy()) + f64::from(3 * self.scale);
-        self.canvas.text(at, self.scale, colors::INK, &name);
+        let at = self.pixel(object.box3d.center.xy()) + f64::from(2 * self.scale);
+        // The smallest letters: boxes lie close together.
+        self.canvas.text(at, 1, colors::of_class(object.class), &name);
     }
 
     /// Outline from above, front edge thick, a line for the way of one second.
