@@ -15,7 +15,7 @@ use super::locality::{EditScores, edit_locality};
 use super::preview::draw_pages;
 use super::sample::LatentSampler;
 use super::step::{Frozen, Problem};
-use super::{DitExperiment, HeldOut, LatentBatch, LatentItem, NoiseKey};
+use super::{DitExperiment, Guidance, HeldOut, LatentBatch, LatentItem, NoiseKey};
 
 /// Samples that the network takes at once.
 const CHUNK: usize = 16;
@@ -107,7 +107,7 @@ impl DitEvaluator {
         Ok(DitScores { loss, loss_no_layout, loss_other_layout, loss_of_zero, samples })
     }
 
-    /// Samples `count` held-out layouts without, with plain and with the config's guidance.
+    /// Samples held-out layouts without, with plain and with the config's guidance.
     ///
     /// # Errors
     /// Whatever a sample reports, cameras that cannot be used.
@@ -119,31 +119,20 @@ impl DitEvaluator {
     ) -> anyhow::Result<GeneratedScores> {
         let items = self.items(frozen, experiment.evaluation.generated)?;
         let best = experiment.sampling.guidance;
-        let mut truth = Moments::new(3 * COLOUR_CELLS * COLOUR_CELLS);
         let guidances = [best.with_scale(0.0), best.with_scale(1.0), best];
+        let mut truth = Moments::new(3 * COLOUR_CELLS * COLOUR_CELLS);
         let mut made = guidances.map(|_| truth.clone());
-        let (mut ignored, mut guided) = (Vec::new(), Vec::new());
+        let [mut ignored, mut guided] = [f64::NAN; 2];
         for (number, chunk) in items.chunks(CHUNK).enumerate() {
-            let cameras = self.cameras(frozen, chunk.len())?;
-            let batch = LatentBatch { items: chunk.to_vec(), pictures: None };
-            let clean = frozen.scaling.unscaled(frozen.clean(&batch, self.seed ^ HELD_OUT)?);
-            add_colours(&mut truth, &frozen.vae.decode(clean, &cameras), frozen)?;
-            let keys = self.keys(chunk);
+            let painter = Painter::new(self, (frozen, sampler, experiment), chunk)?;
+            add_colours(&mut truth, &painter.truth()?, frozen)?;
             let own: Vec<&Layout> = chunk.iter().map(|item| &item.layout).collect();
-            let decode = |layouts: &[&Layout], guidance| -> anyhow::Result<Vec<Vec<f32>>> {
-                let latents = sampler.sample(layouts, &keys, &experiment.preview_sampler(), guidance)?;
-                Ok(frozen.vae.decode(latents, &cameras))
-            };
-            let mut pictures = Vec::new();
             for (guidance, moments) in guidances.iter().zip(&mut made) {
-                let decoded = decode(&own, *guidance)?;
-                add_colours(moments, &decoded, frozen)?;
-                pictures.push(decoded);
+                add_colours(moments, &painter.paint(&own, *guidance)?, frozen)?;
             }
             if number == 0 {
-                let others: Vec<&Layout> = own.iter().cycle().skip(1).take(own.len()).copied().collect();
-                ignored.push(difference(&pictures[0], &decode(&others, guidances[0])?));
-                guided.push(difference(&pictures[2], &decode(&others, guidances[2])?));
+                ignored = painter.change_by_layout(&own, guidances[0])?;
+                guided = painter.change_by_layout(&own, guidances[2])?;
             }
         }
         let truth = truth.statistics("decoded held-out latents")?;
@@ -154,8 +143,8 @@ impl DitEvaluator {
             distance_conditional: conditional?,
             distance_guided: at_best?,
             guidance_scale: best.scale(),
-            guidance_zero_difference: ignored.first().copied().unwrap_or(f64::NAN),
-            guided_difference: guided.first().copied().unwrap_or(f64::NAN),
+            guidance_zero_difference: ignored,
+            guided_difference: guided,
             layouts: items.len(),
         })
     }
@@ -197,10 +186,53 @@ impl DitEvaluator {
         let key = |item: &LatentItem| NoiseKey { seed: self.seed ^ HELD_OUT, token: item.token(), draw: 0 };
         items.iter().map(key).collect()
     }
+}
 
-    fn cameras(&self, frozen: &Frozen, samples: usize) -> anyhow::Result<ViewArrays> {
-        let rigs = vec![self.rig.clone(); samples];
-        Ok(ViewArrays::cameras(&rigs, frozen.vae.image_size(), PadViews::Largest)?)
+/// Some held-out samples, their noise and the cameras that look at them.
+struct Painter<'a> {
+    frozen: &'a Frozen,
+    sampler: &'a LatentSampler<'a>,
+    experiment: &'a DitExperiment,
+    batch: LatentBatch,
+    keys: Vec<NoiseKey>,
+    cameras: ViewArrays,
+    seed: u64,
+}
+
+impl<'a> Painter<'a> {
+    fn new(
+        evaluator: &DitEvaluator,
+        (frozen, sampler, experiment): (&'a Frozen, &'a LatentSampler<'a>, &'a DitExperiment),
+        items: &[LatentItem],
+    ) -> anyhow::Result<Self> {
+        let rigs = vec![evaluator.rig.clone(); items.len()];
+        Ok(Self {
+            frozen,
+            sampler,
+            experiment,
+            batch: LatentBatch { items: items.to_vec(), pictures: None },
+            keys: evaluator.keys(items),
+            cameras: ViewArrays::cameras(&rigs, frozen.vae.image_size(), PadViews::Largest)?,
+            seed: evaluator.seed ^ HELD_OUT,
+        })
+    }
+
+    /// Pictures of the samples' own latents.
+    fn truth(&self) -> anyhow::Result<Vec<Vec<f32>>> {
+        let latents = self.frozen.scaling.unscaled(self.frozen.clean(&self.batch, self.seed)?);
+        Ok(self.frozen.vae.decode(latents, &self.cameras))
+    }
+
+    /// Pictures of layouts.
+    fn paint(&self, layouts: &[&Layout], guidance: Guidance) -> anyhow::Result<Vec<Vec<f32>>> {
+        let latents = self.sampler.sample(layouts, &self.keys, &self.experiment.preview_sampler(), guidance)?;
+        Ok(self.frozen.vae.decode(latents, &self.cameras))
+    }
+
+    /// Mean absolute difference of pictures of equal noise when every sample gets the layout of another.
+    fn change_by_layout(&self, own: &[&Layout], guidance: Guidance) -> anyhow::Result<f64> {
+        let others: Vec<&Layout> = own.iter().cycle().skip(1).take(own.len()).copied().collect();
+        Ok(difference(&self.paint(own, guidance)?, &self.paint(&others, guidance)?))
     }
 }
 

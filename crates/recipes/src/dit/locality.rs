@@ -54,45 +54,56 @@ pub(super) fn edit_locality(
 ) -> anyhow::Result<Option<EditScores>> {
     let projector = Projector::new(frozen, rig);
     let cameras = frozen.vae.cameras(rig)?;
-    let (mut locality, mut inside, mut random) = (EditLocality::default(), Share::default(), Share::default());
-    let mut edits = 0;
-    for item in items {
-        let Some((at, masks)) = projector.best_box(&item.layout) else { continue };
-        if edits == experiment.evaluation.edits {
-            break;
-        }
+    let mut collected = Collected::default();
+    let visible = items.iter().filter_map(|item| Some((item, projector.best_box(&item.layout)?)));
+    for (item, (at, masks)) in visible.take(experiment.evaluation.edits) {
         let mut without = item.layout.clone();
         let removed = without.boxes.remove(at);
         let key = NoiseKey { seed, token: item.token(), draw: 0 };
-        let keys = [key.clone(), key];
         let latents = sampler.sample(
             &[&item.layout, &without],
-            &keys,
+            &[key.clone(), key],
             &experiment.preview_sampler(),
             experiment.sampling.guidance,
         )?;
-        let before = frozen.vae.decode(latents.clone().narrow(0, 0, 1), &cameras);
-        let after = frozen.vae.decode(latents.narrow(0, 1, 1), &cameras);
-        let changed: Vec<Mask> = before.iter().zip(&after).map(|(a, b)| changed_pixels(a, b)).collect();
-        for ((before, after), mask) in before.iter().zip(&after).zip(&masks) {
-            locality.update(before, after, mask);
-        }
-        inside.add(&changed, &masks);
+        let painted = |place: usize| frozen.vae.decode(latents.clone().narrow(0, place, 1), &cameras);
         let mut rng = train::stream(seed, &format!("edits/{}", item.token()), 0);
-        for place in projector.random_boxes(&removed, &masks, &mut rng) {
-            random.add(&changed, &place);
-        }
-        edits += 1;
+        let places = projector.random_boxes(&removed, &masks, &mut rng);
+        collected.add((&painted(0), &painted(1)), &masks, &places);
     }
-    let (changed_in_box, changed_in_random_boxes) = (inside.value(), random.value());
-    let scores = changed_in_box.zip(changed_in_random_boxes).map(|(inside, random)| EditScores {
-        edits,
-        changed_in_box: inside,
-        changed_in_random_boxes: random,
-        ratio: inside / random,
-        change_inside_over_outside: locality.ratio(),
-    });
-    Ok(scores)
+    Ok(collected.scores())
+}
+
+/// Figures of edits so far.
+#[derive(Debug, Default)]
+struct Collected {
+    edits: usize,
+    locality: EditLocality,
+    inside: Share,
+    random: Share,
+}
+
+impl Collected {
+    fn add(&mut self, (before, after): (&[Vec<f32>], &[Vec<f32>]), masks: &[Mask], places: &[Vec<Mask>]) {
+        let changed: Vec<Mask> = before.iter().zip(after).map(|(a, b)| changed_pixels(a, b)).collect();
+        for ((before, after), mask) in before.iter().zip(after).zip(masks) {
+            self.locality.update(before, after, mask);
+        }
+        self.inside.add(&changed, masks);
+        places.iter().for_each(|place| self.random.add(&changed, place));
+        self.edits += 1;
+    }
+
+    fn scores(&self) -> Option<EditScores> {
+        let (inside, random) = (self.inside.value()?, self.random.value()?);
+        Some(EditScores {
+            edits: self.edits,
+            changed_in_box: inside,
+            changed_in_random_boxes: random,
+            ratio: inside / random,
+            change_inside_over_outside: self.locality.ratio(),
+        })
+    }
 }
 
 /// Changed pixels among those of masks.
