@@ -97,19 +97,36 @@ impl Finished {
         }
     }
 
-    /// The picture of a view of a finished frame.
-    pub(super) fn source(&self, index: usize, at: usize, view: &View) -> Option<ImageSource> {
+    /// The picture of a view of a finished frame; `None` where the painter left it out.
+    pub(super) fn source(&self, index: usize, at: usize, view: &View) -> Result<Option<ImageSource>, DataError> {
         let path = self.picture(index, at);
         let size = (view.intrinsics.width, view.intrinsics.height);
-        path.is_file().then(|| ImageSource::File { file: StoredFile::from(path), size })
+        if path.is_file() {
+            return Ok(Some(ImageSource::File { file: StoredFile::from(path), size }));
+        }
+        // Asked second, because the whole folder goes at once.
+        if self.has(index) { Ok(None) } else { Err(self.gone()) }
     }
 
-    /// Removes the folder once the dataset is made.
+    /// Whether another run has made the dataset and taken the folder away.
+    pub(super) fn is_gone(&self) -> bool {
+        !self.folder.is_dir()
+    }
+
+    pub(super) fn gone(&self) -> DataError {
+        let folder = self.folder.display();
+        DataError::Config(format!(
+            "another run of this export has finished it meanwhile, its frames are gone: {folder}"
+        ))
+    }
+
+    /// Removes the folder once the dataset is made, for other runs all at once.
     pub(super) fn remove(&self) -> Result<(), DataError> {
-        match std::fs::remove_dir_all(&self.folder) {
+        let old = self.folder.with_extension("frames-done");
+        match std::fs::rename(&self.folder, &old) {
             // Another run of the same export was quicker.
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
-            removed => removed.map_err(io("remove", &self.folder)),
+            renamed => renamed.and_then(|()| std::fs::remove_dir_all(&old)).map_err(io("remove", &self.folder)),
         }
     }
 }

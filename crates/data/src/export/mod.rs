@@ -66,7 +66,9 @@ pub fn export(
         }
         let frame = source.frame(*index)?;
         let pictures = painter(*index, &frame).map_err(|error| crate::sample::in_frame(&frame.id, error))?;
-        finished.add(*index, &frame, &pictures).map_err(|error| crate::sample::in_frame(&frame.id, error))?;
+        finished.add(*index, &frame, &pictures).map_err(|error| {
+            if finished.is_gone() { finished.gone() } else { crate::sample::in_frame(&frame.id, error) }
+        })?;
     }
     progress(mine.len(), mine.len());
     let frames = source.len();

@@ -9,7 +9,7 @@ use crate::nuscenes::{NuScenesExportConfig, export_nuscenes};
 use crate::nuscenes_writer::write_nuscenes_frames;
 use crate::staging::{self, Staging};
 use crate::{
-    Argoverse2Log, Argoverse2WriterConfig, CategoryRule, DataError, ObjectClass, SceneDataset, SceneFrame,
+    Argoverse2Log, Argoverse2WriterConfig, CategoryRule, DataError, ImageSource, ObjectClass, SceneDataset, SceneFrame,
     write_argoverse2,
 };
 
@@ -58,20 +58,20 @@ pub(super) fn publish(
     let mut frames = Vec::new();
     let mut take = |index: usize, frame: &SceneFrame| {
         let sources = frame.views.iter().enumerate().map(|(at, view)| finished.source(index, at, view));
-        let sources: Vec<_> = sources.collect();
+        let sources: Vec<Option<ImageSource>> = sources.collect::<Result<_, _>>()?;
         let there = frame.views.iter().zip(&sources).filter(|(_, source)| source.is_some());
         frames.push(ExportedFrame {
             scene: frame.id.scene.clone(),
             frame: frame.id.frame.clone(),
             channels: there.map(|(view, _)| view.channel.clone()).collect(),
         });
-        sources
+        Ok::<_, DataError>(sources)
     };
     match config.format {
         ExportFormat::NuScenesTables(tables) => {
             let jpeg_quality = config.jpeg_quality;
             let config = NuScenesExportConfig { jpeg_quality, ..NuScenesExportConfig::new(root.clone(), words) };
-            export_nuscenes(tables, &config, &mut |index, frame| Ok(take(index, frame)), &mut |_, _| {})?;
+            export_nuscenes(tables, &config, &mut |index, frame| take(index, frame), &mut |_, _| {})?;
         }
         ExportFormat::NuScenes => {
             let frames = painted_frames(source, &mut take)?;
@@ -113,11 +113,11 @@ pub(super) fn publish(
 /// The source's frames with their finished pictures.
 fn painted_frames(
     source: &dyn SceneDataset,
-    take: &mut dyn FnMut(usize, &SceneFrame) -> Vec<Option<crate::ImageSource>>,
+    take: &mut dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<ImageSource>>, DataError>,
 ) -> Result<Vec<SceneFrame>, DataError> {
     let painted = |index| {
         let mut frame = source.frame(index)?;
-        let pictures = take(index, &frame);
+        let pictures = take(index, &frame)?;
         for (view, picture) in frame.views.iter_mut().zip(pictures) {
             view.image = picture;
             view.mask = None;

@@ -170,9 +170,10 @@ impl LayoutFile {
             return Err(LayoutError::TooMany { count: self.boxes.len() });
         }
         let boxes = self.boxes.into_iter().map(FileBox::into_box).collect::<Result<_, _>>()?;
-        let layout = Layout { boxes };
+        // Edits may give boxes of an unknown class another one, or take them away.
+        let layout = Layout { boxes }.edited(&self.edits, classes)?;
         layout.check_classes(classes)?;
-        layout.edited(&self.edits, classes)
+        Ok(layout)
     }
 }
 
@@ -263,6 +264,9 @@ mod tests {
             read(&format!(r#"{{"boxes": [{CAR}], "edits": ["remove:car-1", "add:truck:x=20,y=3"]}}"#)).unwrap();
         assert_eq!(layout.boxes.iter().map(|found| found.id.as_str()).collect::<Vec<_>>(), ["truck-1"]);
         assert_eq!(read(r#"{"boxes": []}"#).unwrap(), Layout::default());
+        let tank = CAR.replace("\"car\"", "\"tank\"");
+        let cured = read(&format!(r#"{{"boxes": [{tank}], "edits": ["reclass:car-1:truck"]}}"#)).unwrap();
+        assert_eq!(cured.boxes[0].class, "truck");
     }
 
     #[test]

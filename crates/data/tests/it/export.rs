@@ -267,6 +267,25 @@ fn an_interrupted_export_goes_on_and_never_reads_half_a_frame() {
 }
 
 #[test]
+fn a_run_that_another_one_overtook_says_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = world(RigPreset::NuScenes, "streets");
+    let out = dir.path().join("made");
+    let config = ExportConfig::new(&out, ExportFormat::NuScenes, generator());
+    let mut overtaken = |index: usize, frame: &SceneFrame| {
+        if index == 1 {
+            whole(&source, &config);
+        }
+        paint(index, frame)
+    };
+    let error = export(&source, &config, &mut overtaken, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("has finished it meanwhile"), "{error}");
+    let before = files(&out);
+    assert_eq!(before.keys().filter(|name| name.extension().is_some_and(|end| end == "jpg")).count(), 12);
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+}
+
+#[test]
 fn painters_and_settings_that_do_not_fit_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let source = world(RigPreset::NuScenes, "streets");
