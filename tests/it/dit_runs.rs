@@ -72,11 +72,11 @@ edits = 1
 "#;
 
 /// A folder with a debug autoencoder and the config of a debug transformer on it.
-struct Place(tempfile::TempDir);
+pub struct Place(tempfile::TempDir);
 
 impl Place {
     /// Trains the autoencoder for `steps` steps.
-    fn new(steps: &str) -> Self {
+    pub fn new(steps: &str) -> Self {
         let place = Self(tempfile::tempdir().unwrap());
         let vae = place.path("vae.toml");
         std::fs::write(&vae, DEBUG_RUN.replace("@ROOT@", &place.text("runs"))).unwrap();
@@ -92,16 +92,16 @@ impl Place {
         place
     }
 
-    fn path(&self, part: &str) -> PathBuf {
+    pub fn path(&self, part: &str) -> PathBuf {
         self.0.path().join(part)
     }
 
-    fn text(&self, part: &str) -> String {
+    pub fn text(&self, part: &str) -> String {
         self.path(part).to_string_lossy().into_owned()
     }
 
     /// `train-dit` with `--set` entries and other options.
-    fn train(&self, set: &[&str], options: &[&str]) -> Output {
+    pub fn train(&self, set: &[&str], options: &[&str]) -> Output {
         let set = set.iter().flat_map(|entry| ["--set", entry]);
         let mut command = Command::new(env!("CARGO_BIN_EXE_train-dit"));
         command.arg("--config").arg(self.path("dit.toml")).args(set).args(options).output().unwrap()
@@ -112,7 +112,7 @@ impl Place {
     }
 }
 
-fn refusal(output: Output) -> String {
+pub fn refusal(output: Output) -> String {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success() && !text.contains("panicked"), "{text}");
     text

@@ -13,3 +13,4 @@ mod lightning;
 mod programs;
 mod runs;
 mod sensitivity;
+mod synthesis;

@@ -145,10 +145,10 @@ pub enum DataError {
         path: PathBuf,
     },
     /// A layout of boxes that cannot be used.
-    #[error("{source}: {}", path.display())]
+    #[error("{why}: {}", path.display())]
     Layout {
         /// Complaint.
-        source: crate::layout::LayoutError,
+        why: crate::layout::LayoutError,
         /// The layout's file.
         path: PathBuf,
     },

@@ -11,6 +11,7 @@ pub mod colmap;
 pub mod conditions;
 mod embedded;
 mod error;
+pub mod export;
 mod frame;
 mod image_source;
 mod jpeg;

@@ -86,7 +86,7 @@ impl Staging {
     }
 }
 
-fn check_target(target: &Path, force: bool) -> Result<(), DataError> {
+pub(crate) fn check_target(target: &Path, force: bool) -> Result<(), DataError> {
     if std::fs::symlink_metadata(target).is_err() {
         return Ok(());
     }

@@ -106,6 +106,25 @@ pub fn from_nuscenes(category: &str) -> Option<ObjectClass> {
     })
 }
 
+/// The nuScenes category that stands for a shared class; `None` for signs and [`ObjectClass::Other`], for which the release has none.
+pub const fn nearest_nuscenes(class: ObjectClass) -> Option<&'static str> {
+    use ObjectClass::*;
+    Some(match class {
+        Car => "vehicle.car",
+        Truck => "vehicle.truck",
+        Bus => "vehicle.bus.rigid",
+        Trailer => "vehicle.trailer",
+        ConstructionVehicle => "vehicle.construction",
+        Motorcycle => "vehicle.motorcycle",
+        Bicycle => "vehicle.bicycle",
+        Pedestrian => "human.pedestrian.adult",
+        TrafficCone => "movable_object.trafficcone",
+        Barrier => "movable_object.barrier",
+        Animal => "animal",
+        Sign | Other => return None,
+    })
+}
+
 /// The shared class of an Argoverse 2 category; `None` for a name the taxonomy has no rule for. Riders have boxes of their own there.
 pub fn from_argoverse2(category: &str) -> Option<ObjectClass> {
     use ObjectClass::*;
@@ -208,6 +227,16 @@ mod tests {
         assert_eq!(names[..10], official.map(serde_json::Value::from));
         assert_eq!(names, ObjectClass::ALL.map(|class| serde_json::Value::from(class.name())));
         assert!(ObjectClass::ALL.iter().enumerate().all(|(at, class)| class.index() == at));
+    }
+
+    #[test]
+    fn nearest_categories_lead_back_to_their_class() {
+        for class in ObjectClass::ALL {
+            assert!(nearest_nuscenes(class).is_none_or(|name| from_nuscenes(name) == Some(class)), "{class:?}");
+            let back = nearest_argoverse2(class).and_then(from_argoverse2);
+            let changes = matches!(class, ObjectClass::ConstructionVehicle | ObjectClass::Barrier | ObjectClass::Other);
+            assert_eq!(back == Some(class), !changes, "{class:?}");
+        }
     }
 
     #[test]

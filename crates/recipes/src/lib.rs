@@ -17,6 +17,7 @@ mod reconstruction;
 pub mod rigs;
 pub mod sheet;
 pub mod show;
+pub mod synthesis;
 pub mod tensors;
 mod trainer;
 

@@ -28,6 +28,11 @@ impl Sheet {
         self.rows.push(pictures.into_iter().map(|values| rgb_image(values, h, w)).collect());
     }
 
+    /// Adds a row of pictures of the sheet's size.
+    pub fn row_of(&mut self, pictures: Vec<RgbImage>) {
+        self.rows.push(pictures);
+    }
+
     /// Adds a thin empty row.
     pub fn space(&mut self) {
         self.rows.push(Vec::new());

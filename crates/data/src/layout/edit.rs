@@ -23,7 +23,8 @@ use crate::{ObjectClass, taxonomy};
 /// | `add:car:x=15,y=-3` | a new box; also `z`, `l`, `w`, `h`, `yaw`, `id` |
 /// | `reclass:car-3:truck` | another class, the same shape |
 ///
-/// Angles are radians, or degrees with the ending `deg`. `car-*` in place of an id means every box whose id begins so, `*` every box.
+/// Angles are radians, or degrees with the ending `deg`. `car-*` in place of an id means every box whose id begins so, be it
+/// none, `*` every box.
 /// A box that is added without a size gets a usual one of its class, without `z` it stands on the ground plane of the car's frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
@@ -200,7 +201,7 @@ impl Layout {
         };
         let chosen: Vec<usize> =
             self.boxes.iter().enumerate().filter(|(_, found)| fits(found)).map(|(at, _)| at).collect();
-        if chosen.is_empty() {
+        if chosen.is_empty() && !id.ends_with('*') {
             let ids: Vec<&str> = self.boxes.iter().take(20).map(|found| found.id.as_str()).collect();
             let more = if self.boxes.len() > ids.len() { ", ..." } else { "" };
             return Err(format!("no box is called {id:?}; there are {}{more}", ids.join(", ")));
@@ -311,6 +312,7 @@ mod tests {
         assert_eq!(ids(&edited(&["remove:car-1"]).unwrap()), ["car-2", "bus-1"]);
         assert_eq!(ids(&edited(&["remove:car-*"]).unwrap()), ["bus-1"]);
         assert!(edited(&["remove:*"]).unwrap().boxes.is_empty());
+        assert_eq!(edited(&["remove:truck-*"]).unwrap(), street(), "a beginning may be nobody's");
         let error = edited(&["remove:car-9"]).unwrap_err().to_string();
         assert!(error.contains("car-9") && error.contains("bus-1"), "{error}");
     }

@@ -144,10 +144,21 @@ impl LayoutFile {
     /// # Errors
     /// [`DataError::Io`], naming the file.
     pub fn write(&self, path: &Path) -> Result<(), DataError> {
-        let json = |error: serde_json::Error| DataError::Json { why: error.to_string(), path: path.to_owned() };
-        let mut bytes = serde_json::to_vec_pretty(self).map_err(json)?;
-        bytes.push(b'\n');
-        staging::write_renamed(path, &bytes)
+        let text = self.text().map_err(|error| DataError::Json { why: error.to_string(), path: path.to_owned() })?;
+        staging::write_renamed(path, text.as_bytes())
+    }
+
+    /// One box per line, for people who edit files.
+    fn text(&self) -> Result<String, serde_json::Error> {
+        let mut parts = Vec::new();
+        if let Some(source) = &self.source {
+            parts.push(format!("  \"source\": {}", serde_json::to_string(source)?));
+        }
+        parts.push(format!("  \"boxes\": {}", lines(&self.boxes)?));
+        if !self.edits.is_empty() {
+            parts.push(format!("  \"edits\": {}", lines(&self.edits)?));
+        }
+        Ok(format!("{{\n{}\n}}\n", parts.join(",\n")))
     }
 
     /// The layout with its edits made.
@@ -159,10 +170,16 @@ impl LayoutFile {
             return Err(LayoutError::TooMany { count: self.boxes.len() });
         }
         let boxes = self.boxes.into_iter().map(FileBox::into_box).collect::<Result<_, _>>()?;
-        let layout = Layout { boxes };
+        // Edits may give boxes of an unknown class another one, or take them away.
+        let layout = Layout { boxes }.edited(&self.edits, classes)?;
         layout.check_classes(classes)?;
-        layout.edited(&self.edits, classes)
+        Ok(layout)
     }
+}
+
+fn lines<T: Serialize>(items: &[T]) -> Result<String, serde_json::Error> {
+    let items: Vec<String> = items.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+    Ok(if items.is_empty() { "[]".to_owned() } else { format!("[\n    {}\n  ]", items.join(",\n    ")) })
 }
 
 impl Layout {
@@ -171,7 +188,7 @@ impl Layout {
     /// # Errors
     /// As [`LayoutFile::read`]; [`DataError::Layout`] for what [`LayoutFile::layout`] refuses.
     pub fn read(path: &Path, classes: &LayoutClasses) -> Result<Self, DataError> {
-        let wrap = |source| DataError::Layout { source, path: path.to_owned() };
+        let wrap = |why| DataError::Layout { why, path: path.to_owned() };
         LayoutFile::read(path)?.layout(classes).map_err(wrap)
     }
 
@@ -233,6 +250,12 @@ mod tests {
         assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1, "no half file stays");
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.contains("\"rotation\"") && text.contains("\"yaw\"") && !text.contains("source"), "{text}");
+        assert_eq!(text.lines().count(), 6, "a line per box: {text}");
+        let source = LayoutSource { dataset: "d".into(), scene: "s".into(), frame: "f".into() };
+        let edits = vec!["remove:a".parse().unwrap(), "remove:b".parse().unwrap()];
+        let whole = LayoutFile { edits, ..LayoutFile::of(&Layout::default(), Some(source)) };
+        whole.write(&path).unwrap();
+        assert_eq!(LayoutFile::read(&path).unwrap(), whole);
     }
 
     #[test]
@@ -241,6 +264,9 @@ mod tests {
             read(&format!(r#"{{"boxes": [{CAR}], "edits": ["remove:car-1", "add:truck:x=20,y=3"]}}"#)).unwrap();
         assert_eq!(layout.boxes.iter().map(|found| found.id.as_str()).collect::<Vec<_>>(), ["truck-1"]);
         assert_eq!(read(r#"{"boxes": []}"#).unwrap(), Layout::default());
+        let tank = CAR.replace("\"car\"", "\"tank\"");
+        let cured = read(&format!(r#"{{"boxes": [{tank}], "edits": ["reclass:car-1:truck"]}}"#)).unwrap();
+        assert_eq!(cured.boxes[0].class, "truck");
     }
 
     #[test]

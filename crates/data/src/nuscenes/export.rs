@@ -68,7 +68,7 @@ pub type NewPictures<'a> = dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<Im
 /// Writes the dataset again with other pictures.
 ///
 /// `pictures` is asked for each frame in order and gives one entry for each of its views, in their order; `None` leaves a picture out.
-/// A picture may have any size: it is brought to the one in the tables (between pixel centres when enlarging, by area when shrinking).
+/// A JPEG file of the size in the tables is copied. Any other picture may have any size: it is brought to the one in the tables (between pixel centres when enlarging, by area when shrinking).
 /// Lidar and radar files are not copied. The folder appears when it is complete.
 ///
 /// # Errors
@@ -152,6 +152,11 @@ impl NuScenes {
             let name = self.pictures.file_name(&self.pictures.rows[row as usize], &self.base);
             let path = root.join(&name);
             let (width, height) = picture.size();
+            let same_size = (width, height) == (view.intrinsics.width, view.intrinsics.height);
+            if let Some(bytes) = picture.jpeg_bytes()?.filter(|_| same_size) {
+                staging::create_dir(path.parent().unwrap_or(root))?;
+                return staging::write(&path, &bytes);
+            }
             let edit = ImageEdit::identity(width, height).resize(view.intrinsics.width, view.intrinsics.height);
             let pixels = picture.load(&edit)?;
             let mut bytes = Vec::new();

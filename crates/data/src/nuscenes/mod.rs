@@ -91,6 +91,11 @@ impl NuScenes {
         Ok(Self { config, base, pictures, annotations, expansions, occupancy, rigs, sets, ranges })
     }
 
+    /// Where it was opened.
+    pub const fn roots(&self) -> &crate::store::Roots {
+        &self.config.root
+    }
+
     /// The scenes in frame order.
     pub fn scenes(&self) -> Vec<SceneInfo> {
         let info = |(scene, frames): (&tables::Scene, &Range<usize>)| SceneInfo {

@@ -9,6 +9,7 @@ mod annotations;
 mod arcline;
 mod atlas;
 mod config;
+mod frames;
 mod lidar;
 mod map_expansion;
 mod map_rows;
@@ -27,6 +28,7 @@ use world::{World, WorldConfig};
 
 pub(crate) use config::scaled;
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
+pub(crate) use frames::write_nuscenes_frames;
 
 use crate::DataError;
 use crate::manifest::{Contents, WriterManifest};

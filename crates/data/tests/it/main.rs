@@ -5,6 +5,7 @@ mod argoverse2;
 mod clips;
 mod colmap;
 mod conditions;
+mod export;
 mod fuzzed;
 mod generated;
 mod latents;

@@ -4,9 +4,10 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use rigscape::commands::{
-    ChangeRigArgs, CheckDataArgs, EncodeArgs, EvaluateArgs, ImportArgs, InfoArgs, MakeDataArgs, NovelViewArgs,
-    ReconstructArgs, SampleArgs, ShowDataArgs, change_rig, check_data, encode, evaluate, import, info, make_data,
-    novel_view, reconstruct, run_main, sample, show_data,
+    ChangeRigArgs, CheckDataArgs, EncodeArgs, EvaluateArgs, ImportArgs, InfoArgs, LayoutCommandArgs, MakeDataArgs,
+    NovelViewArgs, ReconstructArgs, ReplaceHistoryArgs, SampleArgs, ShowDataArgs, SweepGuidanceArgs, SynthesizeArgs,
+    change_rig, check_data, encode, evaluate, import, info, layout, make_data, novel_view, reconstruct,
+    replace_history, run_main, sample, show_data, sweep_guidance, synthesize,
 };
 
 /// Multi-camera driving scenes on any camera rig; to train, run train-vae
@@ -22,6 +23,8 @@ enum Command {
     MakeData(MakeDataArgs),
     CheckData(CheckDataArgs),
     ShowData(ShowDataArgs),
+    Layout(LayoutCommandArgs),
+    ReplaceHistory(ReplaceHistoryArgs),
     Encode(Box<EncodeArgs>),
     Evaluate(Box<EvaluateArgs>),
     Import(ImportArgs),
@@ -30,6 +33,8 @@ enum Command {
     NovelView(NovelViewArgs),
     ChangeRig(ChangeRigArgs),
     Sample(SampleArgs),
+    Synthesize(Box<SynthesizeArgs>),
+    SweepGuidance(SweepGuidanceArgs),
 }
 
 fn main() -> ExitCode {
@@ -38,6 +43,8 @@ fn main() -> ExitCode {
         Command::MakeData(args) => make_data(args),
         Command::CheckData(args) => check_data(args),
         Command::ShowData(args) => show_data(args),
+        Command::Layout(args) => layout(args),
+        Command::ReplaceHistory(args) => replace_history(args),
         Command::Encode(args) => encode(args),
         Command::Evaluate(args) => evaluate(args),
         Command::Import(args) => import(args),
@@ -46,5 +53,7 @@ fn main() -> ExitCode {
         Command::NovelView(args) => novel_view(args),
         Command::ChangeRig(args) => change_rig(args),
         Command::Sample(args) => sample(args),
+        Command::Synthesize(args) => synthesize(args),
+        Command::SweepGuidance(args) => sweep_guidance(args),
     })
 }

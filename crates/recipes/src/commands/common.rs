@@ -97,7 +97,7 @@ impl DataArgs {
     }
 }
 
-fn only_version(root: &Path) -> anyhow::Result<String> {
+pub(super) fn only_version(root: &Path) -> anyhow::Result<String> {
     let entries = std::fs::read_dir(root).with_context(|| format!("cannot list {}", root.display()))?;
     let mut versions: Vec<String> = entries
         .filter_map(|entry| Some(entry.ok()?.file_name().to_string_lossy().into_owned()))

@@ -6,7 +6,7 @@ use geometry::glam::{DVec2, DVec3, Vec3Swizzles};
 
 use super::canvas::{Canvas, Color};
 use super::objects::FRONT;
-use super::{PageContent, colors};
+use super::{Layer, PageContent, PageOptions, colors};
 
 /// Distance between the circles around the car, metres.
 const CIRCLES_M: [f64; 4] = [10.0, 20.0, 40.0, 80.0];
@@ -24,8 +24,13 @@ struct Panel {
     scale: u32,
 }
 
+/// The first letters of a name that are drawn; tokens are no reading matter.
+const NAME_LETTERS: usize = 18;
+
 /// The drawn square of this side.
-pub(super) fn draw(content: &PageContent, half_m: f64, side: u32, scale: u32, show_occupancy: bool) -> Canvas {
+pub(super) fn draw(content: &PageContent, options: &PageOptions, side: u32, scale: u32) -> Canvas {
+    let half_m = options.range_m;
+    let show_occupancy = options.layers.contains(&Layer::Occupancy);
     let mut panel = Panel { canvas: Canvas::new(side, side, [34, 36, 40]), half_m, scale };
     if let Some(grid) = content.occupancy.as_ref().filter(|_| show_occupancy) {
         panel.occupancy(grid);
@@ -38,6 +43,9 @@ pub(super) fn draw(content: &PageContent, half_m: f64, side: u32, scale: u32, sh
     }
     panel.ego();
     content.frame.boxes.iter().flatten().for_each(|object| panel.object(object));
+    if options.layers.contains(&Layer::Names) {
+        content.frame.boxes.iter().flatten().for_each(|object| panel.name(object));
+    }
     panel.canvas.label(DVec2::ZERO, scale, colors::INK, &format!("from above, {half_m:.0} m each way"));
     panel.canvas
 }
@@ -139,6 +147,13 @@ impl Panel {
         let points: Vec<DVec2> = outline.map(|(x, y)| self.pixel(DVec2::new(x, y))).to_vec();
         self.canvas.fill(std::slice::from_ref(&points), colors::EGO, 0.5);
         self.canvas.polyline(&points, colors::EGO, f64::from(self.scale));
+    }
+
+    fn name(&mut self, object: &ObjectBox) {
+        let name: String = object.track.chars().take(NAME_LETTERS).collect();
+        let at = self.pixel(object.box3d.center.xy()) + f64::from(2 * self.scale);
+        // The smallest letters: boxes lie close together.
+        self.canvas.text(at, 1, colors::of_class(object.class), &name);
     }
 
     /// Outline from above, front edge thick, a line for the way of one second.

@@ -27,6 +27,8 @@ pub enum Layer {
     OccupancyInViews,
     /// Pixels to ignore
     Masks,
+    /// Names of boxes, from above
+    Names,
 }
 
 /// How a page is drawn.

@@ -46,7 +46,7 @@ pub fn draw_page(mut content: PageContent, options: &PageOptions) -> anyhow::Res
             x += size.0 + GAP;
         }
     }
-    let above = bev::draw(&content, options.range_m, layout.side, scale, has(Layer::Occupancy));
+    let above = bev::draw(&content, options, layout.side, scale);
     page.paste(&above.picture, width - GAP - layout.side, GAP);
     page.paste(&strip.picture, 0, layout.height);
     Ok(page.picture)
