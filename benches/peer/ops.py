@@ -86,10 +86,10 @@ def cases():
     yield "deformable_rays_3d 7 views, 1024 points, 70 % valid", inputs, function
 
 
-def median_ms(body):
+def median_ms(body, least=5):
     body()
     times, begin = [], time.perf_counter()
-    while len(times) < 5 or (time.perf_counter() - begin < 1.0 and len(times) < 200):
+    while len(times) < least or (time.perf_counter() - begin < 1.0 and len(times) < 200):
         start = time.perf_counter()
         body()
         times.append((time.perf_counter() - start) * 1e3)
@@ -110,9 +110,9 @@ def peer(inputs, function):
     return {"forward": forward, "both": median_ms(both)}
 
 
-def ours(bench, only, threads):
+def ours(bench, only, threads, package="ops"):
     """Medians of a Rust bench in milliseconds by kind and name, from the table that divan prints."""
-    command = ["cargo", "bench", "-q", "-p", "rigscape", "-p", "ops", "--bench", bench, "--", only]
+    command = ["cargo", "bench", "-q", "-p", "rigscape", "-p", package, "--bench", bench, "--", only]
     output = subprocess.run(command, check=True, env={**os.environ, "RAYON_NUM_THREADS": str(threads)}, capture_output=True, text=True).stdout
     factor = {"ns": 1e-6, "µs": 1e-3, "ms": 1.0, "s": 1e3}
     figures, kind = {}, None

@@ -68,7 +68,7 @@ fn measure() {
         let forward = peak(|| Feed::new(SIZES, Order::Plain, None).forward(&case));
         let both = peak(|| drop(Feed::new(SIZES, Order::Plain, None).run(&case)));
         let bounds = [inputs + 2 * (inputs + output), inputs + 4 * (inputs + output)];
-        println!("{}: inputs {inputs}, output {output}, forward {forward}, with gradients {both}", case.name);
+        eprintln!("{}: inputs {inputs}, output {output}, forward {forward}, with gradients {both}", case.name);
         for (what, took, bound) in [("forward", forward, bounds[0]), ("with gradients", both, bounds[1])] {
             if took > bound {
                 wrong.push(format!("{} {what}: {took} of {bound} bytes", case.name));
