@@ -110,11 +110,11 @@ pub(super) fn publish(
     Ok(manifest)
 }
 
+/// The finished pictures of a frame, one entry per view.
+type TakePictures<'a> = &'a mut dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<ImageSource>>, DataError>;
+
 /// The source's frames with their finished pictures.
-fn painted_frames(
-    source: &dyn SceneDataset,
-    take: &mut dyn FnMut(usize, &SceneFrame) -> Result<Vec<Option<ImageSource>>, DataError>,
-) -> Result<Vec<SceneFrame>, DataError> {
+fn painted_frames(source: &dyn SceneDataset, take: TakePictures<'_>) -> Result<Vec<SceneFrame>, DataError> {
     let painted = |index| {
         let mut frame = source.frame(index)?;
         let pictures = take(index, &frame)?;

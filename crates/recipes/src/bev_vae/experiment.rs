@@ -222,7 +222,9 @@ impl HingeConfig {
             );
         }
         match self.regulariser {
-            Regulariser::R1FiniteDifference(SlopeConfig { epsilon, every, .. }) if every == 0 || !(epsilon > 0.0) => {
+            Regulariser::R1FiniteDifference(SlopeConfig { epsilon, every, .. })
+                if every == 0 || epsilon.is_nan() || epsilon <= 0.0 =>
+            {
                 bail!("loss.adversarial.hinge.regulariser: every ({every}) and epsilon ({epsilon}) must be above 0")
             }
             Regulariser::Lecam(LecamConfig { decay, .. }) if !(0.0..1.0).contains(&decay) => {

@@ -5,11 +5,11 @@ use std::path::PathBuf;
 use clap::{Args, Parser, ValueEnum};
 use data::layout::{Layout, LayoutClasses, LayoutEdit, LayoutFile, LayoutSource};
 use data::{FrameId, LocalMap, SceneFrame, View};
-use geometry::{CameraRig, RigPreset, Rigid};
+use geometry::{CameraRig, Rigid};
 
 use super::common::{UsageError, say};
 use super::frame_choice::FrameArgs;
-use super::novel_view::parse_rig;
+use crate::rigs::{RIG_HELP, RigChoice};
 use crate::sheet::save_picture;
 use crate::show::{Layer, PageContent, PageOptions, draw_page};
 
@@ -119,8 +119,8 @@ pub struct LayoutCommandArgs {
     #[arg(long, value_name = "FILE")]
     pub picture: Option<PathBuf>,
     /// Cameras of the picture of a layout file, which has none
-    #[arg(long, value_name = "RIG", value_parser = parse_rig, default_value = "nuscenes")]
-    pub rig: RigPreset,
+    #[arg(long, value_name = "RIG", long_help = RIG_HELP, default_value = "nuscenes")]
+    pub rig: RigChoice,
     /// How far the view from above reaches, metres
     #[arg(long, value_name = "M", default_value_t = 50.0)]
     pub range: f64,
@@ -145,7 +145,8 @@ pub fn layout(args: &LayoutCommandArgs) -> anyhow::Result<()> {
         say(format_args!("{} boxes written to {}", chosen.layout.boxes.len(), path.display()))?;
     }
     if let Some(path) = &args.picture {
-        let page = chosen.page.unwrap_or_else(|| blank_page(&args.rig.rig()));
+        let rig = args.rig.open()?;
+        let page = chosen.page.unwrap_or_else(|| blank_page(&rig));
         save_picture(&draw_page(with_layout(page, &chosen.layout), &options)?, path)?;
         say(format_args!("drawn in {}", path.display()))?;
     }

@@ -11,9 +11,9 @@ use data::export::Shard;
 
 use super::common::{UsageError, say};
 use super::layout::{ChosenLayout, LayoutArgs, blank_page, with_layout};
-use super::novel_view::parse_rig;
 use super::synthesize_dataset;
 use crate::evaluate::write_file;
+use crate::rigs::{RIG_HELP, RigChoice};
 use crate::sheet::{Sheet, save_picture};
 use crate::show::{Layer, PageContent, PageOptions, draw_page};
 use crate::synthesis::{SamplingArgs, Synthesiser, cameras_of};
@@ -53,9 +53,9 @@ pub struct SynthesizeArgs {
     /// Folder to make
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Cameras: nuscenes, argoverse2, nuplan, wayve_scenes101, waymo; may be repeated [default: the frame's own, else nuscenes]
-    #[arg(long, value_name = "RIG", value_parser = parse_rig)]
-    pub rig: Vec<RigPreset>,
+    /// Cameras; may be repeated [default: the frame's own, else nuscenes]
+    #[arg(long, value_name = "RIG", long_help = RIG_HELP)]
+    pub rig: Vec<RigChoice>,
     /// Seed of the noise; equal seeds give equal noise whatever the layout and the cameras
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
@@ -140,7 +140,7 @@ fn paint_layouts(args: &SynthesizeArgs, synthesiser: &Synthesiser) -> anyhow::Re
     for named in &named {
         LayoutFile::of(&named.layout, None).write(&args.out.join(format!("{}.json", named.name)))?;
     }
-    for (rig_name, rig) in rigs(args, page.as_ref(), synthesiser) {
+    for (rig_name, rig) in rigs(args, page.as_ref(), synthesiser)? {
         let size = synthesiser.vae.image_size();
         let mut sheet = Sheet::new(size.height as usize, size.width as usize);
         for draw in 0..args.count {
@@ -196,13 +196,17 @@ fn layouts(
     Ok((named, page, token))
 }
 
-fn rigs(args: &SynthesizeArgs, page: Option<&PageContent>, synthesiser: &Synthesiser) -> Vec<(String, CameraRig)> {
+fn rigs(
+    args: &SynthesizeArgs,
+    page: Option<&PageContent>,
+    synthesiser: &Synthesiser,
+) -> anyhow::Result<Vec<(String, CameraRig)>> {
     if !args.rig.is_empty() {
-        return args.rig.iter().map(|preset| (preset.name().to_owned(), preset.rig())).collect();
+        return args.rig.iter().map(|choice| Ok((choice.name(), choice.open()?))).collect();
     }
     match page {
-        Some(page) => vec![("frame".to_owned(), cameras_of(&page.frame, synthesiser.pose_mode()))],
-        None => vec![(RigPreset::NuScenes.name().to_owned(), RigPreset::NuScenes.rig())],
+        Some(page) => Ok(vec![("frame".to_owned(), cameras_of(&page.frame, synthesiser.pose_mode()))]),
+        None => Ok(vec![(RigPreset::NuScenes.name().to_owned(), RigPreset::NuScenes.rig())]),
     }
 }
 

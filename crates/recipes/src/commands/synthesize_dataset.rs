@@ -18,7 +18,7 @@ pub(super) fn export_dataset(args: &SynthesizeArgs, name: ExportName, synthesise
     };
     let rig = match args.rig.as_slice() {
         [] => None,
-        [one] => Some(one.rig()),
+        [one] => Some(one.open()?),
         _ => return Err(UsageError::of("an export has one rig; run the command once for each --rig")),
     };
     // Tables can be kept only where nothing but the pictures is new.

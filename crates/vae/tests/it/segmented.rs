@@ -70,7 +70,8 @@ fn slopes_and_running_means_are_what_they_say() {
     let directions = noise("v", [2, 3, 4, 4], &device);
     let score = |x: Tensor<4>| {
         let n = x.dims()[0];
-        (x * weights.clone().repeat_dim(0, n / 2)).sum_dim(1).sum_dim(2).sum_dim(3).reshape([n])
+        let products = (x * weights.clone().repeat_dim(0, n / 2)).reshape([n, 48]);
+        ops::sum_dim(products, 1).reshape([n])
     };
     let along = (weights.clone() * directions.clone()).inner_values();
     let (a, b): (f64, f64) = (along[..48].iter().sum(), along[48..].iter().sum());
