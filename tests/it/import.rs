@@ -134,6 +134,9 @@ fn averaged_weights_are_found_wherever_they_lie() {
     assert!(again.contains("imported holds checkpoints already"), "{again}");
 }
 
+/// Name, file, options, and what the error says.
+type Case = (&'static str, Vec<u8>, Vec<&'static str>, Vec<&'static str>);
+
 #[test]
 fn files_that_do_not_fit_are_refused_and_nothing_is_written() {
     let sound = state(0.1);
@@ -148,7 +151,7 @@ fn files_that_do_not_fit_are_refused_and_nothing_is_written() {
     let short_average = &listed(&sound)[1..];
     let position = |name: &str| sound.iter().position(|named| named.0 == name).unwrap();
     let bias = position("pre_quant.bias");
-    let cases: Vec<(&str, Vec<u8>, Vec<&str>, Vec<&str>)> = vec![
+    let cases: Vec<Case> = vec![
         ("missing", change(&|s| drop(s.remove(bias))), vec![], vec!["pre_quant.bias: missing, the network needs [6]"]),
         (
             "renamed",
