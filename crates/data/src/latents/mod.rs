@@ -18,7 +18,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{DataError, SceneDataset};
+use crate::{DataError, SceneDataset, staging};
 
 pub use folder::LatentFolder;
 pub use manifest::{LatentHead, MANIFEST};
@@ -87,20 +87,11 @@ fn json_error(path: &Path) -> impl Fn(serde_json::Error) -> DataError {
 
 /// Writes a whole file beside its place, then renames it, so that no reader meets half of one.
 fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
-    let part = part_of(path);
-    crate::staging::write(&part, bytes)?;
-    publish(&part, path)
-}
-
-fn part_of(path: &Path) -> std::path::PathBuf {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
-    path.with_file_name(name)
-}
-
-/// Puts a finished file on the disk and in its place.
-fn publish(part: &Path, path: &Path) -> Result<(), DataError> {
-    let synced = std::fs::File::open(part).and_then(|file| file.sync_all());
-    synced.map_err(crate::staging::io("sync", part))?;
-    std::fs::rename(part, path).map_err(crate::staging::io("rename to", path))
+    let part = path.with_file_name(name);
+    staging::write(&part, bytes)?;
+    let synced = std::fs::File::open(&part).and_then(|file| file.sync_all());
+    synced.map_err(staging::io("sync", &part))?;
+    std::fs::rename(&part, path).map_err(staging::io("rename to", path))
 }

@@ -7,10 +7,10 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use half::f16;
-use safetensors::tensor::{Dtype, Metadata, View, serialize_to_file};
+use safetensors::tensor::{Dtype, Metadata, View, serialize};
 
 use super::record::Record;
-use super::{Latent, LatentType, json_error, part_of, publish};
+use super::{Latent, LatentType, json_error, write_whole};
 use crate::DataError;
 use crate::store::PositionFile;
 
@@ -171,14 +171,13 @@ impl ShardContent {
             (ENDS, Bytes { dtype: Dtype::U64, shape: vec![n], bytes: &self.ends }),
             (RECORDS, Bytes { dtype: Dtype::U8, shape: vec![self.records.len()], bytes: &self.records }),
         ];
-        let part = part_of(path);
-        serialize_to_file(tensors, None, &part).map_err(|error| DataError::Io {
+        let bytes = serialize(tensors, None).map_err(|error| DataError::Io {
             action: "write",
             source: std::io::Error::other(error.to_string()),
-            path: part.clone(),
+            path: path.to_owned(),
         })?;
-        publish(&part, path)?;
-        std::fs::metadata(path).map(|file| file.len()).map_err(crate::staging::io("look at", path))
+        write_whole(path, &bytes)?;
+        Ok(bytes.len() as u64)
     }
 }
 

@@ -105,11 +105,9 @@ fn table(summary: &Summary, outcome: &Outcome) -> String {
     }
     if let Some(edits) = &summary.edits {
         lines.push(format!(
-            "a removed box changes {:.1} % of the pixels where it stood and {:.1} % where boxes at random places would: {:.1} times as \
-             many; {} boxes",
+            "a removed box changes {:.1} % of the pixels where it stood and {:.1} % where boxes at random places would stand; {} boxes",
             edits.changed_in_box * 100.0,
             edits.changed_in_random_boxes * 100.0,
-            edits.ratio,
             edits.edits
         ));
     }

@@ -36,8 +36,8 @@ pub struct EditScores {
     pub changed_in_box: f64,
     /// Share of changed pixels where boxes of their size at random places would stand.
     pub changed_in_random_boxes: f64,
-    /// Of these two shares.
-    pub ratio: f64,
+    /// Of these two shares; `None` where nothing changes at random places.
+    pub ratio: Option<f64>,
     /// Mean absolute change inside over outside.
     pub change_inside_over_outside: Option<f64>,
 }
@@ -100,7 +100,7 @@ impl Collected {
             edits: self.edits,
             changed_in_box: inside,
             changed_in_random_boxes: random,
-            ratio: inside / random,
+            ratio: (random > 0.0).then_some(inside / random),
             change_inside_over_outside: self.locality.ratio(),
         })
     }
