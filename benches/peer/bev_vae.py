@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+import divan
 import ops
 
 VIEWS, SIZE, PATCH, WIDTH, HEADS, BLOCKS = 6, 128, 8, 384, 6, 6
@@ -242,7 +243,7 @@ def main():
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    mine = ops.ours("bev_vae", "", args.threads, package="vae")[None, "small"]
+    mine = divan.medians("bev_vae", "", args.threads, package="vae")[None, "small"]
     ours_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     network = BevVae()
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4, weight_decay=0.01)

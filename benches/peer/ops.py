@@ -7,14 +7,13 @@ on the same machine. A ratio below 1 means that the Rust operation is faster.
 """
 
 import argparse
-import os
-import re
 import statistics
-import subprocess
 import time
 
 import torch
 import torch.nn.functional as F
+
+import divan
 
 
 def deformable_2d(values, shapes, reference, visible, offsets, weights):
@@ -110,25 +109,6 @@ def peer(inputs, function):
     return {"forward": forward, "both": median_ms(both)}
 
 
-def ours(bench, only, threads, package="ops"):
-    """Medians of a Rust bench in milliseconds by kind and name, from the table that divan prints."""
-    command = ["cargo", "bench", "-q", "-p", "rigscape", "-p", package, "--bench", bench, "--", only]
-    output = subprocess.run(command, check=True, env={**os.environ, "RAYON_NUM_THREADS": str(threads)}, capture_output=True, text=True).stdout
-    factor = {"ns": 1e-6, "µs": 1e-3, "ms": 1.0, "s": 1e3}
-    figures, kind = {}, None
-    for line in output.splitlines():
-        if not (row := re.match(r"(│  |   )?[├╰]─ (.*)", line)):
-            continue
-        cells = [cell.strip() for cell in row[2].split("│")]
-        timed = re.match(r"(.*?)\s{2,}[\d.]+ \S+$", cells[0])
-        if not row[1]:
-            kind = cells[0]
-        if timed:
-            number, unit = cells[2].split()
-            figures[kind if row[1] else None, timed[1]] = float(number) * factor[unit]
-    return figures
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, default=2)
@@ -136,7 +116,7 @@ def main():
     args = parser.parse_args()
     torch.manual_seed(7)
     torch.set_num_threads(args.threads)
-    figures = ours("ops", args.only, args.threads)
+    figures = divan.medians("ops", args.only, args.threads)
     print(f"PyTorch {torch.__version__}, {args.threads} threads, milliseconds (median)\n")
     print("| operation | forward | PyTorch | ratio | forward + backward | PyTorch | ratio |")
     print("|---|---|---|---|---|---|---|")

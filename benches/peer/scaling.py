@@ -2,7 +2,7 @@
 
     python benches/peer/scaling.py [--threads 2] [--out benches/pictures/sampling_scale.png]
 
-Needs torch (for ops.py, which reads the bench's table) and matplotlib.
+Needs matplotlib.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-import ops
+import divan
 
 
 def main():
@@ -20,7 +20,7 @@ def main():
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", default="benches/pictures/sampling_scale.png")
     args = parser.parse_args()
-    figures = ops.ours("scaling", "", args.threads)
+    figures = divan.medians("scaling", "", args.threads)
     figure, axes = plt.subplots(1, 2, figsize=(10, 4))
     for axis, what, fixed in zip(axes, ("queries", "views"), ("6 views", "4096 queries")):
         for kind, label in (("forward", "forward"), ("both", "forward + backward")):

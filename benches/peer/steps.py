@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+import divan
 import ops
 
 
@@ -94,7 +95,7 @@ def main():
         "dit_stack": (DitStack, [n(4, 256, 384), n(4, 384)]),
         "unet_level": (UnetLevel, [n(2, 320, 28, 50), n(2, 1280), n(2, 77, 768)]),
     }
-    figures = ops.ours("steps", "", args.threads)
+    figures = divan.medians("steps", "", args.threads)
     print(f"PyTorch {torch.__version__}, {args.threads} threads, milliseconds (median)\n")
     print("| step | rigscape | PyTorch | ratio |\n|---|---|---|---|")
     for name, (network, inputs) in cases.items():

@@ -106,7 +106,10 @@ pub fn keep_freed_memory() {
         #[allow(unsafe_code)]
         // SAFETY: mallopt takes any value and changes the policy of later calls only.
         unsafe {
-            mallopt(M_MMAP_THRESHOLD, 1 << 30);
+            // Older versions refuse more than 32 MiB; larger tensors then keep going back.
+            if mallopt(M_MMAP_THRESHOLD, 1 << 30) == 0 {
+                mallopt(M_MMAP_THRESHOLD, 32 << 20);
+            }
             mallopt(M_TRIM_THRESHOLD, i32::MAX);
         }
     }
