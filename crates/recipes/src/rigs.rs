@@ -83,11 +83,11 @@ impl FromStr for RigChoice {
         let plain = text.to_ascii_lowercase().replace(['_', '-'], "");
         let known = RigPreset::ALL.into_iter().find(|preset| {
             let short = match preset {
-                RigPreset::Argoverse2 => "av2",
-                RigPreset::WayveScenes101 => "ws101",
-                _ => "",
+                RigPreset::Argoverse2 => Some("av2"),
+                RigPreset::WayveScenes101 => Some("ws101"),
+                _ => None,
             };
-            plain == preset.name().replace('_', "") || plain == short
+            plain == preset.name().replace('_', "") || Some(plain.as_str()) == short
         });
         let names: Vec<String> = RigPreset::ALL.iter().map(|preset| preset.name().replace('_', "")).collect();
         known.map(Self::BuiltIn).ok_or_else(|| {
