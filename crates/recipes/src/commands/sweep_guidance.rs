@@ -80,12 +80,13 @@ pub fn sweep_guidance(args: &SweepGuidanceArgs) -> anyhow::Result<()> {
     let value = |at: usize, of: fn(&crate::synthesis::SweepPoint) -> f64| report.points.get(at).map_or(f64::NAN, of);
     let charts = [
         (
-            format!("Frechet distance to the dataset's pictures ({}), against guidance", report.features),
+            "Frechet distance to the dataset's pictures, by guidance".to_owned(),
             curve("distance, smaller is better", &|at| value(at, |point| point.distance)),
         ),
         ("mean absolute change against guidance 0".to_owned(), curve("change", &|at| value(at, |point| point.change))),
     ];
-    let title = format!("{} frames, {} pictures per scale", report.frames, report.pictures);
+    let title =
+        format!("{} frames, {} pictures per scale; features: {}", report.frames, report.pictures, report.features);
     save_picture(&draw_curves(&title, &charts), &args.out.join("sweep.png"))?;
     say("| guidance | distance | change |\n|---|---|---|")?;
     for point in &report.points {

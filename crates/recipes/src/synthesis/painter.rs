@@ -36,7 +36,7 @@ pub struct LayoutPainter<'a> {
 }
 
 impl LayoutPainter<'_> {
-    /// All cameras of one frame, from one latent.
+    /// All cameras of one frame, from one latent. Of a frame's own cameras, one without a picture gets none here either.
     ///
     /// # Errors
     /// [`DataError::Config`] with the model's complaint.
@@ -47,6 +47,7 @@ impl LayoutPainter<'_> {
             self.synthesiser.pictures(latent, &cameras_of(frame, self.synthesiser.pose_mode()))
         };
         let pictures = made().map_err(|error| DataError::Config(format!("{error:#}")))?;
-        Ok(pictures.into_iter().map(Some).collect())
+        let painted = |view: &data::View| self.source.rig.is_some() || view.image.is_some();
+        Ok(pictures.into_iter().zip(&frame.views).map(|(picture, view)| painted(view).then_some(picture)).collect())
     }
 }
