@@ -3,7 +3,7 @@
 //! Without further features the "other device" is the composition on `flex`; the features `ndarray` and `wgpu` add theirs.
 
 use burn::tensor::{Bool, Device, Tensor, TensorData};
-use ops::Interpolation;
+use ops::{Interpolation, PixelCentres};
 
 /// Smooth values in [-1, 1] without a random generator, which would differ between backends.
 fn wave<const D: usize>(shape: [usize; D], phase: f64) -> TensorData {
@@ -51,6 +51,7 @@ impl Probe {
         self.affine();
         self.attention();
         self.grids();
+        self.resizing();
         self.deformable();
         self.sums();
         self.results
@@ -68,6 +69,10 @@ impl Probe {
             let inputs = [&leaf, &gain_leaf, &bias_leaf];
             self.record("layer_norm", &inputs[..1 + with_gain as usize + with_bias as usize], y);
         }
+        let ((leaf, x), (shift_leaf, shift)) = (self.leaf([3, 5, 24], 0.0), self.leaf([3, 1, 24], 1.0));
+        let (scale_leaf, scale) = self.leaf([3, 1, 24], 2.0);
+        let y = ops::modulated_layer_norm(x, shift, scale, 1e-6);
+        self.record("modulated_layer_norm", &[&leaf, &shift_leaf, &scale_leaf], y);
         let ((leaf, x), (gain_leaf, gain)) = (self.leaf([3, 5, 24], 0.0), self.leaf([24], 1.0));
         self.record("rms_norm", &[&leaf, &gain_leaf], ops::rms_norm(x, gain, 1e-6));
         for norm in [ops::group_norm, ops::group_norm_silu] {
@@ -135,6 +140,13 @@ impl Probe {
             let (grid_leaf, grid) = self.leaf([2, z * y, x, 2], 1.0);
             let y = ops::grid_sample_2d(input, grid * 1.2, false, Interpolation::Bilinear);
             self.record("grid_sample_2d", &[&leaf, &grid_leaf], y);
+        }
+    }
+
+    fn resizing(&mut self) {
+        for (size, centres) in [([7, 3], PixelCentres::Half), ([2, 9], PixelCentres::Corner)] {
+            let (leaf, x) = self.leaf([2, 3, 4, 6], 0.0);
+            self.record("resize_bilinear", &[&leaf], ops::resize_bilinear(x, size, centres));
         }
     }
 
