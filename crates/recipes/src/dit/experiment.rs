@@ -150,7 +150,7 @@ impl DitExperiment {
         let asked = &self.data.loader.augment;
         let allowed = match self.latents.source {
             LatentSource::Online { .. } => AugmentConfig {
-                color_jitter: asked.color_jitter.clone(),
+                color_jitter: asked.color_jitter,
                 grayscale_probability: asked.grayscale_probability,
                 drop_view_probability: asked.drop_view_probability,
                 ..AugmentConfig::default()
