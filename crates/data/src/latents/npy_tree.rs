@@ -54,12 +54,17 @@ pub struct NpyTreeConfig {
 }
 
 impl NpyTreeConfig {
+    /// The split's folder, which holds the logs.
+    pub fn folder(&self) -> PathBuf {
+        self.root.join(self.kind.folder()).join(&self.split)
+    }
+
     pub(super) fn file(&self, scene: &str, timestamp_ns: i64) -> PathBuf {
         self.scene(scene).join(format!("{timestamp_ns}.npy"))
     }
 
     pub(super) fn scene(&self, scene: &str) -> PathBuf {
-        self.root.join(self.kind.folder()).join(&self.split).join(scene)
+        self.folder().join(scene)
     }
 }
 
@@ -106,8 +111,8 @@ impl NpyTree {
             }
         }
         if frames.is_empty() {
-            let path = config.root.join(config.kind.folder()).join(&config.split);
-            return Err(DataError::Empty { what: format!("the set of annotated frames of {}", dataset.name()), path });
+            let what = format!("the set of annotated frames of {}", dataset.name());
+            return Err(DataError::Empty { what, path: config.folder() });
         }
         let tree = Self { config, shape, dataset, frames };
         tree.latent(0)?;

@@ -159,7 +159,7 @@ fn write(args: &EncodeArgs, vae: &FrozenVae, part: &Part) -> anyhow::Result<(Pat
                 layout: Some(args.layout.into()),
             };
             let encoded = encode_tree(vae, &datasets, &tree, &options)?;
-            Ok((tree.root.join(tree.kind.folder()).join(&tree.split), encoded))
+            Ok((tree.folder(), encoded))
         }
     }
 }

@@ -83,7 +83,7 @@ fn npy_tree(experiment: &DitExperiment, vae: &FrozenVae, tree: &TreeLatents, run
         check_decoded(vae, first, tree.least_psnr_db)?;
     }
     let measured = run.join(STATISTICS);
-    let stated = tree.root.join(STATISTICS);
+    let stated = tree.root.join(tree.kind.folder()).join(&tree.train_split).join(STATISTICS);
     let statistics = if stated.is_file() {
         LatentStatistics::read(&stated)?
     } else if measured.is_file() {

@@ -144,7 +144,8 @@ pub fn encode_folder(
     Ok(Encoded { samples: frames.places.len(), earlier, unannotated: frames.unannotated, statistics })
 }
 
-/// Encodes into the published layout, one file per instant; files that are there already are kept. The statistics file lies in the root.
+/// Encodes into the published layout, one file per instant; files that are there already are kept. The statistics file lies in the
+/// split's folder.
 ///
 /// # Errors
 /// Whatever a frame reports; names that are no plain file names.
@@ -178,7 +179,7 @@ pub fn encode_tree(
         }
     }
     let statistics = collector.finish(vae.hash(), &frames.names().join("+"), vae.grid()).map_err(anyhow::Error::msg)?;
-    statistics.write(&tree.root.join(STATISTICS))?;
+    statistics.write(&tree.folder().join(STATISTICS))?;
     Ok(Encoded { samples: frames.places.len(), earlier, unannotated: frames.unannotated, statistics })
 }
 
