@@ -27,8 +27,8 @@ use std::path::Path;
 use world::{World, WorldConfig};
 
 pub(crate) use config::scaled;
-pub(crate) use frames::write_nuscenes_frames;
 pub use config::{Manifest, ManifestScene, NuScenesWriterConfig};
+pub(crate) use frames::write_nuscenes_frames;
 
 use crate::DataError;
 use crate::manifest::{Contents, WriterManifest};

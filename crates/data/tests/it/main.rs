@@ -3,8 +3,8 @@
 mod archives;
 mod argoverse2;
 mod clips;
-mod export;
 mod colmap;
+mod export;
 mod fuzzed;
 mod generated;
 mod latents;
