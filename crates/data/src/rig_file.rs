@@ -6,6 +6,9 @@ use geometry::{CameraRig, Rigid};
 
 use crate::DataError;
 
+/// Rounding of a quaternion's length.
+const UNIT: f64 = 1e-12;
+
 /// Reads a JSON file that holds a [`CameraRig`].
 ///
 /// # Errors
@@ -31,8 +34,12 @@ pub fn read_rig(path: &Path) -> Result<CameraRig, DataError> {
         let row = camera.channel.clone();
         let bad = |source| DataError::Calibration { row, source, path: path.into() };
         let pose = &camera.ego_from_cam;
-        let pose = Rigid::from_wxyz(pose.wxyz(), pose.translation.to_array());
-        camera.ego_from_cam = pose.and_then(|pose| camera.camera().map(|_| pose)).map_err(bad)?;
+        let sound = Rigid::from_wxyz(pose.wxyz(), pose.translation.to_array());
+        let sound = sound.and_then(|pose| camera.camera().map(|_| pose)).map_err(bad)?;
+        // A rotation that is one already comes back to the bit.
+        if (camera.ego_from_cam.rotation.length() - 1.0).abs() > UNIT {
+            camera.ego_from_cam = sound;
+        }
     }
     Ok(rig)
 }
