@@ -32,16 +32,11 @@ impl SceneDataset for Files {
 
     fn frame(&self, index: usize) -> Result<SceneFrame, DataError> {
         let rig = RigPreset::NuScenes.rig();
-        let views = rig.cameras.iter().zip(&self.0[index * VIEWS..]).map(|(camera, path)| View {
-            channel: camera.channel.clone(),
-            timestamp_ns: 0,
-            image: Some(source(path)),
-            mask: None,
-            intrinsics: camera.intrinsics,
-            lens: camera.lens,
-            ego_from_cam: camera.ego_from_cam,
-            world_from_ego: Rigid::IDENTITY,
-        });
+        let views = rig
+            .cameras
+            .iter()
+            .zip(&self.0[index * VIEWS..])
+            .map(|(camera, path)| View { image: Some(source(path)), ..View::of_camera(camera, Rigid::IDENTITY) });
         Ok(SceneFrame {
             id: FrameId { dataset: "files".into(), scene: "one".into(), frame: index.to_string() },
             timestamp_ns: 0,

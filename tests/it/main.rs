@@ -4,6 +4,7 @@ mod architecture;
 mod bev_vae;
 mod configs;
 mod data_commands;
+mod dit_place;
 mod dit_runs;
 mod evaluate;
 mod import;

@@ -8,7 +8,7 @@ use data::layout::{Layout, LayoutClasses, LayoutFile};
 use data::nuscenes::{NuScenes, NuScenesConfig};
 use serde_json::Value;
 
-use crate::dit_runs::{Place, refusal};
+use crate::dit_place::{Place, refusal};
 use crate::programs::{files_below, rigscape};
 use crate::runs::must;
 

@@ -221,16 +221,8 @@ pub fn rerig(frame: &SceneFrame, rig: &CameraRig) -> Result<SceneFrame, DataErro
             camera,
             world_from_cam: frame.world_from_ego * mounted.ego_from_cam,
         });
-        Ok(View {
-            channel: mounted.channel.clone(),
-            timestamp_ns: frame.timestamp_ns,
-            image,
-            mask: None,
-            intrinsics: mounted.intrinsics,
-            lens: mounted.lens,
-            ego_from_cam: mounted.ego_from_cam,
-            world_from_ego: frame.world_from_ego,
-        })
+        let view = View::of_camera(mounted, frame.world_from_ego);
+        Ok(View { timestamp_ns: frame.timestamp_ns, image, ..view })
     });
     let views = views.collect::<Result<Vec<View>, DataError>>()?;
     Ok(SceneFrame { views, ..frame.clone() })

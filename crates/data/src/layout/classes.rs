@@ -19,40 +19,6 @@ const NUSCENES: [&str; 10] = [
     "traffic_cone",
 ];
 
-/// The annotated categories of the sensor dataset in the order of the official enumeration.
-const ARGOVERSE2: [&str; 30] = [
-    "ANIMAL",
-    "ARTICULATED_BUS",
-    "BICYCLE",
-    "BICYCLIST",
-    "BOLLARD",
-    "BOX_TRUCK",
-    "BUS",
-    "CONSTRUCTION_BARREL",
-    "CONSTRUCTION_CONE",
-    "DOG",
-    "LARGE_VEHICLE",
-    "MESSAGE_BOARD_TRAILER",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN",
-    "MOTORCYCLE",
-    "MOTORCYCLIST",
-    "OFFICIAL_SIGNALER",
-    "PEDESTRIAN",
-    "RAILED_VEHICLE",
-    "REGULAR_VEHICLE",
-    "SCHOOL_BUS",
-    "SIGN",
-    "STOP_SIGN",
-    "STROLLER",
-    "TRAFFIC_LIGHT_TRAILER",
-    "TRUCK",
-    "TRUCK_CAB",
-    "VEHICULAR_TRAILER",
-    "WHEELCHAIR",
-    "WHEELED_DEVICE",
-    "WHEELED_RIDER",
-];
-
 /// Names of classes; the position is the channel of the occupancy. Checkpoints store the table, and it is compared by name.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -69,7 +35,7 @@ impl LayoutClasses {
 
     /// The thirty categories of Argoverse 2.
     pub fn argoverse2() -> Self {
-        Self::of(&ARGOVERSE2)
+        Self::of(&taxonomy::ARGOVERSE2)
     }
 
     /// The classes all datasets share, [`ObjectClass::ALL`].

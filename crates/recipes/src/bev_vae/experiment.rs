@@ -22,7 +22,7 @@ pub struct Experiment {
     /// Run or checkpoint folder whose averaged weights the network starts from; fresh weights without it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_from: Option<PathBuf>,
-    /// Computes every block again on the way back instead of keeping what it computed: less memory, about a third more time.
+    /// Computes every block again on the way back instead of keeping what it computed: half the memory, about a fifth more time.
     #[serde(default)]
     pub checkpointing: bool,
     /// Where results go.

@@ -177,16 +177,7 @@ pub(super) fn with_layout(mut page: PageContent, layout: &Layout) -> PageContent
 
 /// A frame without pictures.
 pub(super) fn blank_page(rig: &CameraRig) -> PageContent {
-    let view = |camera: &geometry::RigCamera| View {
-        channel: camera.channel.clone(),
-        timestamp_ns: 0,
-        image: None,
-        mask: None,
-        intrinsics: camera.intrinsics,
-        lens: camera.lens,
-        ego_from_cam: camera.ego_from_cam,
-        world_from_ego: Rigid::IDENTITY,
-    };
+    let view = |camera| View::of_camera(camera, Rigid::IDENTITY);
     let frame = SceneFrame {
         id: FrameId { dataset: "layout".to_owned(), scene: "file".to_owned(), frame: "0".to_owned() },
         timestamp_ns: 0,

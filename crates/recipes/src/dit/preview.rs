@@ -47,16 +47,7 @@ pub(super) fn draw_pages(
 /// The frame that the pictures stand for.
 fn painted_frame(item: &LatentItem, rig: &CameraRig, pictures: Vec<RgbImage>, scale: f64) -> SceneFrame {
     let view = |(camera, picture): (&geometry::RigCamera, RgbImage)| {
-        let bare = View {
-            channel: camera.channel.clone(),
-            timestamp_ns: 0,
-            image: None,
-            mask: None,
-            intrinsics: camera.intrinsics,
-            lens: camera.lens,
-            ego_from_cam: camera.ego_from_cam,
-            world_from_ego: Rigid::IDENTITY,
-        };
+        let bare = View::of_camera(camera, Rigid::IDENTITY);
         bare.with_picture(picture)
     };
     let FrameId { dataset, scene, frame } = &item.id;

@@ -36,7 +36,7 @@ pub struct UNetExperiment {
     /// Train low-rank adapters beside the weights of `init_from`, which stay as they are.
     #[serde(default)]
     pub adapter: Option<LoraConfig>,
-    /// Differentiate the UNet block by block, each computed twice: the memory of one block instead of all, about a third more time.
+    /// Differentiate the UNet block by block, each computed twice: the memory of one block instead of all, about a quarter more time.
     #[serde(default)]
     pub checkpointing: bool,
     /// What reads captions.

@@ -123,16 +123,7 @@ mod tests {
     fn projector(preset: RigPreset, ahead_m: f64) -> (Projector, RigCamera) {
         let camera = preset.rig().cameras.swap_remove(0);
         let world_from_ego = Rigid::from_yaw(0.7, DVec3::new(5e5, 4e6, 10.0));
-        let view = View {
-            channel: camera.channel.clone(),
-            timestamp_ns: 0,
-            image: None,
-            mask: None,
-            intrinsics: camera.intrinsics,
-            lens: camera.lens,
-            ego_from_cam: camera.ego_from_cam,
-            world_from_ego: world_from_ego * Rigid::from_yaw(0.0, DVec3::new(ahead_m, 0.0, 0.0)),
-        };
+        let view = View::of_camera(&camera, world_from_ego * Rigid::from_yaw(0.0, DVec3::new(ahead_m, 0.0, 0.0)));
         let drawn = DVec2::new(f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height)) * 0.5;
         (Projector::new(&view, &world_from_ego, drawn).unwrap(), camera)
     }
